@@ -1,0 +1,1 @@
+"""Bus back-ends, one file each; `drivers.bus` selects by address."""

@@ -1,0 +1,17 @@
+"""Errors of this room. Library exceptions are translated into these at the boundary."""
+
+
+class DriverError(Exception):
+    """Base of every error raised by `drivers`."""
+
+
+class BusError(DriverError):
+    """A bus could not be opened, or failed while in use."""
+
+
+class BusAddressError(BusError):
+    """A bus address could not be understood; the message names the forms that can."""
+
+
+class AmplifierError(DriverError):
+    """An amplifier did not answer, refused a setting, or disagrees with the configuration."""

@@ -1,0 +1,1 @@
+"""The emulator: real protocol state machines in front of a pymunk arm."""

@@ -1,0 +1,34 @@
+"""What every emulated amplifier is to the emulator: something on the wire in front of a servo."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+from sim_backend.servo import Servo
+
+Transmit = Callable[[bytes], None]
+"""Puts one 16-byte frame record on the wire."""
+
+
+class AmplifierNode(ABC):
+    """An emulated amplifier: protocol state machine between the wire and one `Servo`."""
+
+    def __init__(self, servo: Servo, transmit: Transmit) -> None:
+        self.servo = servo
+        self._transmit = transmit
+
+    @abstractmethod
+    def power_on(self) -> None:
+        """Announce the node as it does after power-up."""
+
+    @abstractmethod
+    def receive(self, can_id: int, data: bytes) -> None:
+        """Take one data frame from the wire. Never raises, whatever the bytes.
+
+        Args:
+            can_id: Identifier with flags (`drivers.frame`).
+            data: 0 to 8 bytes.
+        """
+
+    @abstractmethod
+    def tick(self, dt_s: float) -> None:
+        """Advance the node's timers (heartbeat, watchdogs) by `dt_s` of emulated time."""
