@@ -1,6 +1,7 @@
 """The bus interface and its registry: one address line selects a back-end.
 
-Addresses: `unix:PATH`, `socketcan:IFACE` (short `vcan0`, `can0`), `python-can:INTERFACE:CHANNEL`.
+Addresses: `unix:PATH`, `socketcan:IFACE` (short `vcan0`, `can0`),
+`python-can:INTERFACE:CHANNEL[@BITRATE]`.
 Back-ends are imported when first used, so that a missing optional library only matters to
 those who ask for it.
 """
@@ -20,11 +21,15 @@ class BusStats:
 
     frames_sent: int = 0
     frames_received: int = 0
+    """Frames from other participants, without the controller's error reports."""
     send_failures: int = 0
     """Frames the back-end could not take (queue full): lost, counted, never retried in a cycle."""
     error_frames: int = 0
+    """Error reports received (`ERR_FLAG`)."""
     receive_overflows: int = 0
     """Frames the kernel dropped because nobody read them in time, where the back-end can tell."""
+    malformed_records: int = 0
+    """Records that are no classic CAN frame (wrong size, CAN FD): dropped, never raised."""
 
 
 class Bus(ABC):
@@ -57,6 +62,11 @@ class Bus(ABC):
         Raises:
             BusError: If the bus is gone.
         """
+
+    def _count_error_report(self) -> None:
+        """Book the frame just counted as received as an error report instead."""
+        self.stats.frames_received -= 1
+        self.stats.error_frames += 1
 
     @abstractmethod
     def fileno(self) -> int:
@@ -95,7 +105,7 @@ def split_address(address: str) -> tuple[str, str]:
     if not colon:
         scheme, rest = "socketcan", address
     if scheme not in _BACKENDS or not rest:
-        forms = "unix:PATH, socketcan:IFACE (or just IFACE), python-can:INTERFACE:CHANNEL"
+        forms = "unix:PATH, socketcan:IFACE (or just IFACE), python-can:INTERFACE:CHANNEL[@BITRATE]"
         raise BusAddressError(f"bus address {address!r} is not one of: {forms}")
     return scheme, rest
 

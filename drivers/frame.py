@@ -5,6 +5,7 @@ The hot path never builds a frame object: a frame *is* its 16 bytes, on every bu
 """
 
 import struct
+import sys
 
 FRAME_SIZE = 16
 EFF_FLAG = 0x8000_0000  # 29-bit identifier
@@ -12,6 +13,10 @@ RTR_FLAG = 0x4000_0000  # remote request
 ERR_FLAG = 0x2000_0000  # error report of the controller, not a frame from the wire
 SFF_MASK = 0x0000_07FF
 EFF_MASK = 0x1FFF_FFFF
+FLAGS_INDEX = 3 if sys.byteorder == "little" else 0
+"""Index of the record's byte that holds the flags: records are in the host's byte order."""
+ERR_BIT = ERR_FLAG >> 24
+"""`frame[FLAGS_INDEX] & ERR_BIT`: is it an error report, at the cost of one index."""
 
 _LAYOUT = struct.Struct("=IB3x8s")
 unpack_header = struct.Struct("=IB").unpack_from
@@ -43,9 +48,14 @@ def unpack_frame(frame: bytes) -> tuple[int, bytes]:
 
 
 def worst_case_bits(length: int, *, is_extended: bool = False) -> int:
-    """Bits a classic data frame can occupy on the wire, stuffing and 3-bit interframe space included.
+    """Return the bits a classic data frame can occupy on the wire, worst-case stuffing included.
 
-    Source: CAN 2.0 bit stuffing, worst case; at 1 Mbit/s one bit is one microsecond.
+    The 3-bit interframe space is included too. Source: CAN 2.0, one stuff bit after four bits of
+    the stuffed part of the frame; at 1 Mbit/s one bit is one microsecond.
+
+    Args:
+        length: Data bytes, 0 to 8.
+        is_extended: 29-bit identifier.
     """
     fixed, stuffable = (67, 53) if is_extended else (47, 33)
     return 8 * length + fixed + (stuffable + 8 * length) // 4

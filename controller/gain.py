@@ -1,0 +1,124 @@
+"""The gain of tau = -Kd S: constant, or tuned by the paper's neuro-fuzzy network (section 4)."""
+
+import math
+from abc import ABC, abstractmethod
+
+from controller.settings import LawSettings
+
+BIG, MEDIUM, SMALL = 0, 1, 2
+
+
+def memberships(S_abs: float) -> tuple[float, float, float]:
+    """Degrees to which |S| is (big, medium, small): a partition of unity by two sigmoids.
+
+    Reading of figs 6 and 7: small ends near 0.2 rad/s, big begins near 0.6 rad/s. A plain sum
+    (17) of consequences then stays between the smallest and the largest beta.
+    """
+    a = 1.0 / (1.0 + math.exp((0.20 - S_abs) / 0.04)) if S_abs < 20.0 else 1.0
+    b = 1.0 / (1.0 + math.exp((0.60 - S_abs) / 0.12)) if S_abs < 20.0 else 1.0
+    medium = a - b
+    return b, medium if medium > 0.0 else 0.0, 1.0 - a
+
+
+class Gain(ABC):
+    """Gain of one joint, between bounds that ramp when they are changed."""
+
+    __slots__ = ("Kd_max", "Kd_min", "_goal", "_ramp_per_s")
+
+    def __init__(self, Kd_min: float, Kd_max: float, ramp_per_s: float) -> None:
+        self.Kd_min = Kd_min
+        self.Kd_max = Kd_max
+        self._ramp_per_s = ramp_per_s
+        self._goal: tuple[float, float] | None = None
+
+    def set_bounds(self, Kd_min: float, Kd_max: float) -> None:
+        """Let the bounds move to new values at the configured rate, from the next step on."""
+        self._goal = (Kd_min, Kd_max)
+
+    @abstractmethod
+    def step(self, S: float, dt_s: float) -> float:
+        """Return the gain for this cycle, in Nm s/rad, and adapt.
+
+        Args:
+            S: Extended error manifold of the joint, rad/s, finite.
+            dt_s: Time since the last step.
+        """
+
+    def _ramp_bounds(self, dt_s: float) -> None:
+        assert self._goal is not None  # noqa: S101 - callers check; keeps the hot path short
+        goal_min, goal_max = self._goal
+        reach = self._ramp_per_s * dt_s
+        self.Kd_min += max(-reach, min(reach, goal_min - self.Kd_min))
+        self.Kd_max += max(-reach, min(reach, goal_max - self.Kd_max))
+        if self.Kd_min == goal_min and self.Kd_max == goal_max:
+            self._goal = None
+
+
+class ConstantGain(Gain):
+    """A constant Kd (11), clipped to the bounds."""
+
+    __slots__ = ("Kd",)
+
+    def __init__(self, Kd: float, bounds: tuple[float, float], ramp_per_s: float) -> None:
+        super().__init__(*bounds, ramp_per_s)
+        self.Kd = Kd
+
+    def step(self, S: float, dt_s: float) -> float:
+        """Return the constant, clipped to the bounds in force."""
+        if self._goal is not None:
+            self._ramp_bounds(dt_s)
+        return max(self.Kd_min, min(self.Kd_max, self.Kd))
+
+
+class SelfTuningGain(Gain):
+    """Kd_hat = sum_i beta_i mu_i(|S|) (17), beta adapted by a reading of (28).
+
+    Adaptations, per 1 ms, with mu of the previous cycle and S of this one:
+    `literal`: beta -= rate S alpha mu, as printed (not mirror-symmetric);
+    `absolute`: beta -= rate |S| alpha mu; `true_sign`: beta += rate |S| alpha mu, with the sign
+    that d(q_err)/dKd really has; `off`. Every beta is boxed to [Kd_min, Kd_max] and the sum is
+    clipped to it. When the bounds move, each beta keeps its place between them.
+    """
+
+    __slots__ = ("_is_absolute", "_mu", "_place", "_rate_per_s", "beta")
+
+    def __init__(self, settings: LawSettings, joint: int) -> None:
+        super().__init__(settings.Kd_min[joint], settings.Kd_max[joint], settings.Kd_ramp_per_s)
+        sign = {"off": 0.0, "literal": -1.0, "absolute": -1.0, "true_sign": 1.0}
+        rate = sign[settings.adaptation] * settings.learning_rate * settings.alpha[joint]
+        self._rate_per_s = rate / 1e-3
+        self._is_absolute = settings.adaptation != "literal"
+        self._mu = (0.0, 0.0, 0.0)
+        self.beta = [self._box(beta) for beta in settings.beta]
+        self._place = [0.0, 0.0, 0.0]
+        self._note_places()
+
+    def step(self, S: float, dt_s: float) -> float:
+        """Return Kd_hat for this cycle; see the class."""
+        if self._rate_per_s != 0.0:
+            self._adapt(S, dt_s)
+        if self._goal is not None:
+            self._ramp_bounds(dt_s)
+            span = self.Kd_max - self.Kd_min
+            self.beta = [self.Kd_min + place * span for place in self._place]
+        big, medium, small = self._mu = memberships(S if S >= 0.0 else -S)
+        beta = self.beta
+        Kd = beta[BIG] * big + beta[MEDIUM] * medium + beta[SMALL] * small
+        if Kd < self.Kd_min:
+            return self.Kd_min
+        return Kd if Kd < self.Kd_max else self.Kd_max
+
+    def _adapt(self, S: float, dt_s: float) -> None:
+        step = self._rate_per_s * dt_s * (abs(S) if self._is_absolute else S)
+        self.beta = [
+            self._box(beta + step * mu) for beta, mu in zip(self.beta, self._mu, strict=True)
+        ]
+        self._note_places()
+
+    def _box(self, beta: float) -> float:
+        return max(self.Kd_min, min(self.Kd_max, beta))
+
+    def _note_places(self) -> None:
+        span = self.Kd_max - self.Kd_min
+        if span > 0.0:
+            self._place = [(beta - self.Kd_min) / span for beta in self.beta]

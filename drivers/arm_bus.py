@@ -1,0 +1,202 @@
+"""All axes of one arm on one bus: start-up, and the cyclic exchange of the 1 kHz loop."""
+
+from collections.abc import Callable, Sequence
+
+from drivers.axis import Axis, AxisInfo, AxisStatus, FrameHandler
+from drivers.bus import Bus
+from drivers.errors import AmplifierError, BusError
+from drivers.frame import ERR_FLAG, pack_frame, unpack_frame, unpack_header
+
+SYNC_ID = 0x080
+HEARTBEAT_ID = 0x700
+RECEIVED, SENT = 0, 1
+
+FrameLog = Callable[[int, bytes], None]
+"""Called with (RECEIVED or SENT, 16-byte record) for every frame, in the order seen."""
+
+
+class ArmBus:
+    """The axes of one arm and the bus they share.
+
+    A cycle is `request_feedback`, `collect`, `send_torques`. Nothing in it waits except `collect`,
+    and that never longer than its deadline.
+
+    Attributes:
+        axes: Shoulder first.
+        stats: The bus's own counters.
+        late_frames: Feedback that arrived after its cycle had ended; discarded.
+        unknown_frames: Frames that belong to no axis of this arm.
+        error_frames: Error reports of the CAN controller.
+    """
+
+    def __init__(
+        self, bus: Bus, axes: Sequence[Axis], *, now_ns: Callable[[], int], master_id: int = 127
+    ) -> None:
+        self.axes = list(axes)
+        self.stats = bus.stats
+        self.late_frames = 0
+        self.unknown_frames = 0
+        self.error_frames = 0
+        self._bus = bus
+        self._now_ns = now_ns
+        self._log: FrameLog | None = None
+        self._handlers: dict[int, FrameHandler] = {}
+        self._sync = pack_frame(SYNC_ID) if any(a.uses_sync for a in axes) else None
+        self._heartbeat = pack_frame(HEARTBEAT_ID + master_id, b"\x05")
+        self._heartbeat_every = 0
+        self._cycles_to_heartbeat = 0
+        self._extra: list[bytes] = []
+
+    def log_frames(self, log: FrameLog | None) -> None:
+        """Have every frame reported from now on, or none."""
+        self._log = log
+
+    def configure(self, *, heartbeat_cycles: int) -> list[AxisInfo]:
+        """Set up every axis for cyclic torque; all end disabled.
+
+        Args:
+            heartbeat_cycles: The master's own heartbeat is sent every so many cycles.
+
+        Raises:
+            AmplifierError: See `Axis.configure`, or if another master is at work on the bus.
+            BusError: If the bus is gone.
+        """
+        self._heartbeat_every = heartbeat_cycles
+        port = _Port(self._bus, self._now_ns, self._log)
+        if port.wait(SYNC_ID, 0.02) is not None:
+            raise AmplifierError(
+                "another master sends SYNC on this bus; stop the other daemon first"
+            )
+        infos = [axis.configure(port) for axis in self.axes]
+        if len({info.is_lockstep for info in infos}) > 1:
+            raise AmplifierError("some axes run in lockstep and some by the clock; choose one")
+        for axis in self.axes:
+            axis.start(port)
+            self._handlers.update(axis.handlers())
+        return infos
+
+    def request_feedback(self) -> None:
+        """Begin a cycle: discard what came too late for the last one, then send SYNC."""
+        self._drain()
+        if self._sync is not None:
+            self._send(self._sync)
+
+    def collect(self, deadline_ns: int) -> bool:
+        """Receive until every axis has fresh feedback, or until the deadline.
+
+        Returns:
+            True if all feedback is fresh. Axes without it have `age_cycles` > 0 and keep their
+            last values.
+
+        Raises:
+            BusError: If the bus is gone.
+        """
+        for axis in self.axes:
+            axis.age_cycles += 1
+        missing = len(self.axes)
+        recv, handlers, log = self._bus.recv, self._handlers, self._log
+        while missing:
+            remaining_s = (deadline_ns - self._now_ns()) * 1e-9
+            frame = recv(remaining_s if remaining_s > 0.0 else 0.0)
+            if frame is None:
+                break
+            if log is not None:
+                log(RECEIVED, frame)
+            handler = handlers.get(unpack_header(frame)[0])
+            if handler is None:
+                self._count_foreign(frame)
+            elif handler(frame):
+                missing -= 1
+        return missing == 0
+
+    def send_torques(self, tau_Nm: Sequence[float]) -> None:
+        """End a cycle: send every axis its command, and the heartbeat when it is due.
+
+        Raises:
+            BusError: If the bus is gone.
+        """
+        for axis, tau in zip(self.axes, tau_Nm, strict=True):
+            self._send(axis.command(tau))
+            axis.end_cycle()
+        if self._extra:
+            self._send(self._extra.pop(0))
+        self._cycles_to_heartbeat -= 1
+        if self._cycles_to_heartbeat <= 0:
+            self._cycles_to_heartbeat = self._heartbeat_every
+            self._send(self._heartbeat)
+
+    def inject_fault(self, joint: int) -> bool:
+        """Queue the frame that faults an emulated amplifier; False if the family has none."""
+        frame = self.axes[joint].inject_fault()
+        if frame is None:
+            return False
+        self._extra.append(frame)
+        return True
+
+    @property
+    def is_enabled(self) -> bool:
+        """True if every axis applies torque."""
+        return all(axis.status is AxisStatus.ENABLED for axis in self.axes)
+
+    def first_in(self, status: AxisStatus) -> Axis | None:
+        """Return the first axis with this status, None if there is none."""
+        return next((axis for axis in self.axes if axis.status is status), None)
+
+    @property
+    def age_cycles(self) -> int:
+        """Age of the oldest feedback, 0 = all fresh."""
+        return max(axis.age_cycles for axis in self.axes)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.close()
+
+    def _send(self, frame: bytes) -> None:
+        if self._bus.send(frame) and self._log is not None:
+            self._log(SENT, frame)
+
+    def _drain(self) -> None:
+        """Take frames left over from the last cycle; feedback among them is late and not used."""
+        while (frame := self._bus.recv(0.0)) is not None:
+            if self._log is not None:
+                self._log(RECEIVED, frame)
+            handler = self._handlers.get(unpack_header(frame)[0])
+            if handler is None:
+                self._count_foreign(frame)
+            elif handler(frame):
+                self.late_frames += 1
+
+    def _count_foreign(self, frame: bytes) -> None:
+        if unpack_header(frame)[0] & ERR_FLAG:
+            self.error_frames += 1
+        else:
+            self.unknown_frames += 1
+
+
+class _Port:
+    """The bus during start-up: frames that nobody waits for are dropped."""
+
+    def __init__(self, bus: Bus, now_ns: Callable[[], int], log: FrameLog | None) -> None:
+        self._bus = bus
+        self._now_ns = now_ns
+        self._log = log
+
+    def send(self, can_id: int, data: bytes) -> None:
+        frame = pack_frame(can_id, data)
+        if not self._bus.send(frame):
+            raise BusError("the bus takes no frames (send queue full); is any other node on it?")
+        if self._log is not None:
+            self._log(SENT, frame)
+
+    def wait(self, can_id: int, timeout_s: float) -> bytes | None:
+        deadline_ns = self._now_ns() + round(timeout_s * 1e9)
+        while True:
+            remaining_ns = deadline_ns - self._now_ns()
+            frame = self._bus.recv(max(0, remaining_ns) * 1e-9)
+            if frame is None:
+                return None
+            if self._log is not None:
+                self._log(RECEIVED, frame)
+            got_id, data = unpack_frame(frame)
+            if got_id == can_id:
+                return data

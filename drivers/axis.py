@@ -1,0 +1,118 @@
+"""What every amplifier family offers to the loop: one `Axis` per joint."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol
+
+
+class AxisStatus(IntEnum):
+    """What an amplifier says of itself."""
+
+    DISABLED = 0
+    """Answers; no torque."""
+    ENABLED = 1
+    """Applies the torque it is sent."""
+    FAULT = 2
+    """Reports a fault; no torque until it is reset."""
+    LOST = 3
+    """Its heartbeat is missing, or it restarted by itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class AxisInfo:
+    """What an amplifier told about itself at start-up."""
+
+    name: str
+    torque_resolution_Nm: float
+    angle_resolution_rad: float
+    is_lockstep: bool
+    """Emulated, and its time advances by one period per SYNC instead of by the clock."""
+
+
+class Port(Protocol):
+    """The bus as an axis sees it during start-up, when waiting is allowed."""
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Put a frame on the bus.
+
+        Raises:
+            BusError: If the bus is gone or its queue stays full.
+        """
+
+    def wait(self, can_id: int, timeout_s: float) -> bytes | None:
+        """Return the data of the next frame with this identifier, None when the time is up."""
+
+
+FrameHandler = Callable[[bytes], bool]
+"""Takes one 16-byte record; True if it was this cycle's feedback of the axis. Never raises."""
+
+
+class Axis(ABC):
+    """One joint's amplifier, master side.
+
+    Attributes:
+        label: How messages name the axis, e.g. `joint 1 (cia402 node 1)`.
+        q_rad: Joint angle of the last fresh feedback.
+        tau_meas_Nm: Joint torque the amplifier reported with it.
+        age_cycles: Cycles since that feedback; 0 = fresh.
+        status: What the amplifier says of itself.
+        note: One line about the last fault or emergency message, empty if there was none.
+        uses_sync: The family needs a CANopen SYNC at the start of each cycle.
+    """
+
+    uses_sync = False
+
+    def __init__(self, label: str) -> None:
+        self.label = label
+        self.q_rad = 0.0
+        self.tau_meas_Nm = 0.0
+        self.age_cycles = 1
+        self.status = AxisStatus.DISABLED
+        self.note = ""
+
+    @abstractmethod
+    def configure(self, port: Port) -> AxisInfo:
+        """Set the amplifier up for cyclic torque, disabled, and check its scales.
+
+        Raises:
+            AmplifierError: If it does not answer, refuses a setting, contradicts the
+                configuration or is already enabled. No torque has been commanded.
+        """
+
+    @abstractmethod
+    def start(self, port: Port) -> None:
+        """Begin cyclic operation, once all axes of the arm are configured; still disabled."""
+
+    @abstractmethod
+    def handlers(self) -> dict[int, FrameHandler]:
+        """Identifiers of the frames this axis takes in operation, each with its handler."""
+
+    @abstractmethod
+    def command(self, tau_Nm: float) -> bytes:
+        """Return the frame to send in this cycle: torque if enabled, and power-state requests.
+
+        Args:
+            tau_Nm: Joint torque, positive about the joint's axis, finite.
+        """
+
+    @abstractmethod
+    def enable(self) -> None:
+        """Ask for power; `status` becomes ENABLED some cycles later."""
+
+    @abstractmethod
+    def disable(self) -> None:
+        """Ask for torque off, with the next command frame."""
+
+    @abstractmethod
+    def reset_fault(self) -> None:
+        """Ask the amplifier to leave its fault state; it stays disabled."""
+
+    @abstractmethod
+    def end_cycle(self) -> None:
+        """Count this cycle in the axis's own watchdogs."""
+
+    def inject_fault(self) -> bytes | None:
+        """Return the frame that puts an *emulated* amplifier into fault, None if there is none."""
+        return None

@@ -1,0 +1,1 @@
+"""The daemon: configuration, real-time loop, gateway, recordings, reports, client and commands."""
