@@ -1,1 +1,1 @@
-"""Control laws, gain tuner, estimators, trajectories, limits, state machine: pure: no clock, no I/O."""
+"""Control laws, tuner, estimators, trajectories, limits, state machine; pure: no clock, no I/O."""

@@ -12,7 +12,7 @@ Motion: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 _NODES = np.arange(-2.0, 3.0)
 _POWERS = np.arange(5)
 _TO_QUARTIC = np.linalg.inv(np.vander(_NODES, increasing=True))
-# Row i: weights that give the derivative, at node i, of the quartic through five equidistant points.
+# Row i: weights of the derivative, at node i, of the quartic through five equidistant points.
 _FIRST = (_POWERS * _NODES[:, None] ** np.maximum(_POWERS - 1, 0)) @ _TO_QUARTIC
 _SECOND = (_POWERS * (_POWERS - 1) * _NODES[:, None] ** np.maximum(_POWERS - 2, 0)) @ _TO_QUARTIC
 STENCIL_POINTS = 5
@@ -89,7 +89,7 @@ def stencil_knots(period_s: float, q_rad: FloatArray) -> Motion:
 
 
 def minimum_jerk_knots(times_s: FloatArray, q_rad: FloatArray) -> Motion:
-    """Give timed points the velocities and accelerations of least squared jerk, at rest at both ends.
+    """Give timed points velocities and accelerations of least squared jerk, at rest at both ends.
 
     The curve through them is the quintic spline: jerk and snap are continuous as well. They
     follow from a symmetric positive definite block-tridiagonal system with one 2 x 2 block
@@ -111,7 +111,7 @@ def minimum_jerk_knots(times_s: FloatArray, q_rad: FloatArray) -> Motion:
 def _jerk_equations(
     span_s: FloatArray, step_rad: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Continuity of snap (row 0) and jerk (row 1) at each inner point: diagonal, upper, right side."""
+    """Continuity of snap and jerk at each inner point: diagonal, upper blocks, right side."""
     h, k = span_s[:-1], span_s[1:]
     mixed = 36.0 / k**2 - 36.0 / h**2
     diagonal = _blocks(192.0 / h**3 + 192.0 / k**3, mixed, mixed, 9.0 / h + 9.0 / k)

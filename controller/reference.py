@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -27,12 +28,12 @@ class MotionState:
 
     q_rad: FloatArray
     dq_rad_s: FloatArray
-    ddq_rad_s: FloatArray
+    ddq_rad_s2: FloatArray
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
             object.__setattr__(self, name, _frozen(getattr(self, name), 1))
-        if not self.q_rad.shape == self.dq_rad_s.shape == self.ddq_rad_s.shape:
+        if not self.q_rad.shape == self.dq_rad_s.shape == self.ddq_rad_s2.shape:
             raise TrajectoryError("a motion state has one q, dq and ddq per joint")
 
     @classmethod
@@ -44,7 +45,7 @@ class MotionState:
     @property
     def is_at_rest(self) -> bool:
         """No velocity and no acceleration, rounding aside."""
-        speed = max(np.abs(self.dq_rad_s).max(), np.abs(self.ddq_rad_s).max())
+        speed = max(np.abs(self.dq_rad_s).max(), np.abs(self.ddq_rad_s2).max())
         return bool(speed <= _AT_REST)
 
 
@@ -56,7 +57,7 @@ class MotionLimits:
         q_min_rad: Soft lower limit of the joint angle.
         q_max_rad: Soft upper limit of the joint angle.
         dq_max_rad_s: Largest speed, > 0.
-        ddq_max_rad_s: Largest acceleration, in rad/s^2, > 0.
+        ddq_max_rad_s2: Largest acceleration, > 0.
         dddq_max_rad_s3: Largest jerk of limit-aware moves, > 0.
         following_error_rad: Largest distance between reference and joint.
         max_duration_s: Longest reference, approach and final braking included.
@@ -65,7 +66,7 @@ class MotionLimits:
     q_min_rad: tuple[float, ...]
     q_max_rad: tuple[float, ...]
     dq_max_rad_s: tuple[float, ...]
-    ddq_max_rad_s: tuple[float, ...]
+    ddq_max_rad_s2: tuple[float, ...]
     dddq_max_rad_s3: tuple[float, ...]
     following_error_rad: tuple[float, ...]
     max_duration_s: float
@@ -117,7 +118,9 @@ class Violation:
         unit = _UNITS[self.quantity]
         value, limit = distinct(self.value, self.limit)
         kind = "soft limit" if self.quantity == "position" else "limit"
-        return f"{head} {value} {unit} at t = {self.time_s:.2f} s is beyond the {kind} {limit} {unit}"
+        return (
+            f"{head} {value} {unit} at t = {self.time_s:.2f} s is beyond the {kind} {limit} {unit}"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +130,7 @@ class Reference:
     Attributes:
         q_rad: Joint angles, shape (samples, joints), read-only.
         dq_rad_s: Their rates, same shape.
-        ddq_rad_s: Their accelerations in rad/s^2, same shape.
+        ddq_rad_s2: Their accelerations in rad/s^2, same shape.
         period_s: Time between samples.
 
     Raises:
@@ -136,13 +139,13 @@ class Reference:
 
     q_rad: FloatArray
     dq_rad_s: FloatArray
-    ddq_rad_s: FloatArray
+    ddq_rad_s2: FloatArray
     period_s: float
 
     def __post_init__(self) -> None:
-        for name in ("q_rad", "dq_rad_s", "ddq_rad_s"):
+        for name in ("q_rad", "dq_rad_s", "ddq_rad_s2"):
             object.__setattr__(self, name, _frozen(getattr(self, name), 2))
-        if not self.q_rad.shape == self.dq_rad_s.shape == self.ddq_rad_s.shape:
+        if not self.q_rad.shape == self.dq_rad_s.shape == self.ddq_rad_s2.shape:
             raise TrajectoryError("q, dq and ddq of a reference must have one shape")
         if not self.period_s > 0.0:
             raise TrajectoryError(f"the period must be positive, not {self.period_s} s")
@@ -172,9 +175,13 @@ class Reference:
         """Motion at the last sample."""
         return self.state(-1)
 
+    def rows(self) -> FloatArray:
+        """Return one row per sample: q, dq, ddq of all joints; shape (samples, 3 * joints)."""
+        return np.hstack((self.q_rad, self.dq_rad_s, self.ddq_rad_s2))
+
     def state(self, sample: int) -> MotionState:
         """Return the motion at a sample; negative numbers count from the end."""
-        return MotionState(self.q_rad[sample], self.dq_rad_s[sample], self.ddq_rad_s[sample])
+        return MotionState(self.q_rad[sample], self.dq_rad_s[sample], self.ddq_rad_s2[sample])
 
     def check(self, limits: MotionLimits) -> Violation | None:
         """Return the first violation of the position, velocity and acceleration limits, or None.
@@ -188,14 +195,16 @@ class Reference:
         if limits.joints != self.joints:
             raise TrajectoryError(f"limits of {limits.joints} joints, {self.joints} in reference")
         speed = np.asarray(limits.dq_max_rad_s)
-        rate = np.asarray(limits.ddq_max_rad_s)
+        rate = np.asarray(limits.ddq_max_rad_s2)
         q_range = np.asarray(limits.q_min_rad), np.asarray(limits.q_max_rad)
         found = (
             self._first("position", self.q_rad, q_range),
             self._first("velocity", self.dq_rad_s, (-speed, speed)),
             self._first("velocity", np.diff(self.q_rad, axis=0) / self.period_s, (-speed, speed)),
-            self._first("acceleration", self.ddq_rad_s, (-rate, rate)),
-            self._first("acceleration", np.diff(self.dq_rad_s, axis=0) / self.period_s, (-rate, rate)),
+            self._first("acceleration", self.ddq_rad_s2, (-rate, rate)),
+            self._first(
+                "acceleration", np.diff(self.dq_rad_s, axis=0) / self.period_s, (-rate, rate)
+            ),
         )
         return min((v for v in found if v is not None), key=lambda v: v.time_s, default=None)
 
@@ -225,13 +234,13 @@ def concatenate(references: Sequence[Reference]) -> Reference:
     """
     if not references:
         raise TrajectoryError("there is no reference to join")
-    for before, after in zip(references, references[1:], strict=False):
+    for before, after in pairwise(references):
         _check_join(before, after)
     first, *rest = references
     return Reference(
         np.concatenate([first.q_rad, *(r.q_rad[1:] for r in rest)]),
         np.concatenate([first.dq_rad_s, *(r.dq_rad_s[1:] for r in rest)]),
-        np.concatenate([first.ddq_rad_s, *(r.ddq_rad_s[1:] for r in rest)]),
+        np.concatenate([first.ddq_rad_s2, *(r.ddq_rad_s2[1:] for r in rest)]),
         first.period_s,
     )
 
@@ -249,7 +258,7 @@ def _check_join(before: Reference, after: Reference) -> None:
     if before.period_s != after.period_s or before.joints != after.joints:
         raise TrajectoryError("references to be joined must have one period and the same joints")
     end, start = before.end, after.start
-    for name in ("q_rad", "dq_rad_s", "ddq_rad_s"):
+    for name in ("q_rad", "dq_rad_s", "ddq_rad_s2"):
         if not np.allclose(getattr(end, name), getattr(start, name), rtol=1e-9, atol=1e-9):
             raise TrajectoryError(f"references do not meet: {name} jumps where they join")
 

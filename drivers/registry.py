@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import Field
 
 from drivers.axis import Axis
 from drivers.cia402.settings import Cia402Settings
 
-AnyAxisSettings = Annotated[Cia402Settings, Field(discriminator=None)]
+AnyAxisSettings = Cia402Settings
 """Settings of any family, told apart by `family`."""
 
 _FAMILIES = {  # family -> "module:class" of its master side

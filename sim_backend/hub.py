@@ -8,10 +8,9 @@ import fcntl
 import os
 import select
 import socket
-import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -24,8 +23,9 @@ from drivers.errors import BusError
 from drivers.frame import FRAME_SIZE
 from sim_backend.errors import SimError
 
-_BATCH = 64  # frames read from one client before the next one has its turn
+_BATCH = 64  # most frames handed over at once
 _BACKLOG = 16
+_CLIENT_LIMIT = 64  # far below what select() can hold
 _MODE = 0o660
 
 
@@ -129,44 +129,27 @@ class ClientStats:
 
 
 class _Client:
-    __slots__ = ("endpoint", "fd", "recv", "send", "stats")
+    __slots__ = ("endpoint", "recv", "send", "stats")
 
     def __init__(self, endpoint: socket.socket) -> None:
         self.endpoint = endpoint
-        self.fd = endpoint.fileno()
-        self.send = endpoint.send
         self.recv = endpoint.recv
+        self.send = endpoint.send
         self.stats = ClientStats()
 
     def put(self, frame: bytes) -> None:
         """Queue one frame for the client; never blocks, never raises."""
         try:
             self.send(frame)
-        except BlockingIOError:
+        except OSError:  # full, or gone: `wait` reads what it left behind, then lets it go
             self.stats.frames_lost += 1
-        except OSError:
-            pass  # it has gone; `wait` reads what it left behind, then drops it
 
-    def take(self) -> tuple[list[bytes], bool]:
-        """Return the frames at hand, and whether the client is still there."""
-        frames: list[bytes] = []
-        is_there = True
-        try:
-            for _ in range(_BATCH):
-                record = self.recv(RECORD_LIMIT)
-                if len(record) == FRAME_SIZE:
-                    frames.append(record)
-                elif not record and is_hung_up(self.endpoint):
-                    is_there = False
-                    break
-                else:
-                    self.stats.malformed_records += 1
-        except BlockingIOError:
-            pass
-        except OSError:
-            pass  # left with frames unread: its own last frames still come with the next read
-        self.stats.frames_received += len(frames)
-        return frames, is_there
+    def is_gone(self, record: bytes) -> bool:
+        """Judge a record that is no frame: the end of the connection, or something malformed."""
+        if not record and is_hung_up(self.endpoint):
+            return True
+        self.stats.malformed_records += 1
+        return False
 
 
 class UnixHub(Wire):
@@ -182,40 +165,154 @@ class UnixHub(Wire):
 
     def __init__(self, path: str) -> None:
         self.path = path
-        self._listener = _listen(path)
+        self._listener = _listen(Path(path))
         self._inode = Path(path).stat().st_ino
-        self._listener_fd = self._listener.fileno()
-        self._clients: list[_Client] = []
-        self._readable = [self._listener_fd]
+        self._clients: dict[int, _Client] = {}
+        self._readable = [self._listener.fileno()]  # the listener first: see `_collect`
+        self._lost_by_gone = 0
 
     @property
     def clients(self) -> list[ClientStats]:
         """Counters of the clients now connected, in the order in which they came."""
-        return [client.stats for client in self._clients]
+        return [client.stats for client in self._clients.values()]
+
+    @property
+    def frames_lost(self) -> int:
+        """Frames that some client did not get, over all clients there have been."""
+        return self._lost_by_gone + sum(stats.frames_lost for stats in self.clients)
 
     def transmit(self, frame: bytes) -> None:
         """Send one frame to every client; see `Wire.transmit`."""
-        for client in self._clients:
+        for client in self._clients.values():
             client.put(frame)
 
     def wait(self, timeout_s: float) -> list[bytes]:
-        """See `Wire.wait`. Clients come and go in here."""
+        """Return one frame from each client that has any; see `Wire.wait`.
+
+        Reading on until nothing is left would delay the first frame by a failing read.
+        """
         deadline_s = monotonic() + timeout_s
         while True:
             try:
-                ready = select.select(self._readable, (), (), timeout_s)[0]
-            except (OSError, ValueError) as error:
+                ready = select.select(self._readable, (), (), max(0.0, timeout_s))[0]
+            except ValueError as error:
                 raise SimError(f"the bus at unix:{self.path} is closed") from error
-            if not ready:
-                return ready
             frames = self._collect(ready)
             timeout_s = deadline_s - monotonic()
             if frames or timeout_s <= 0.0:
                 return frames
 
     def _collect(self, ready: list[int]) -> list[bytes]:
-        if ready[0] == self._listener_fd:
-            self._accept()
-        if len(self._clients) == 1: 
-            ...
-        return []
+        frames: list[bytes] = []
+        for fd in ready:
+            client = self._clients.get(fd)
+            if client is None:  # first, so that a newcomer sees what comes after it
+                self._accept()
+                continue
+            try:
+                record = client.recv(RECORD_LIMIT)
+            except OSError:
+                continue  # it left with frames unread; its own last ones come with the next read
+            if len(record) == FRAME_SIZE:
+                client.stats.frames_received += 1
+                self._relay(record, client)
+                frames.append(record)
+            elif client.is_gone(record):
+                self._let_go(fd)
+        return frames
+
+    def _relay(self, frame: bytes, sender: _Client) -> None:
+        for client in self._clients.values():
+            if client is not sender:
+                client.put(frame)
+
+    def _accept(self) -> None:
+        try:
+            endpoint, _ = self._listener.accept()
+        except OSError:
+            return  # gone again
+        if len(self._clients) >= _CLIENT_LIMIT:
+            endpoint.close()
+            return
+        endpoint.setblocking(False)
+        enlarge_send_queue(endpoint)
+        self._clients[endpoint.fileno()] = _Client(endpoint)
+        self._readable.append(endpoint.fileno())
+
+    def _let_go(self, fd: int) -> None:
+        client = self._clients.pop(fd)
+        self._readable.remove(fd)
+        self._lost_by_gone += client.stats.frames_lost
+        client.endpoint.close()
+
+    def close(self) -> None:
+        """Hang up on all clients and remove the socket file."""
+        for fd in list(self._clients):
+            self._let_go(fd)
+        if self._listener.fileno() >= 0:
+            self._listener.close()
+            self._remove_file()
+
+    def _remove_file(self) -> None:
+        path = Path(self.path)
+        with suppress(OSError):
+            if path.stat().st_ino == self._inode:  # not somebody else's by now
+                path.unlink()
+
+
+def _listen(path: Path) -> socket.socket:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        os.fchmod(listener.fileno(), _MODE)  # the file is born with it, whatever the umask adds
+        with _directory_locked(path.parent):
+            _remove_stale(path)
+            listener.bind(str(path))
+            path.chmod(_MODE)
+            listener.listen(_BACKLOG)
+        listener.setblocking(False)
+    except OSError as error:
+        listener.close()
+        raise SimError(_explain(path, error)) from error
+    except SimError:
+        listener.close()
+        raise
+    return listener
+
+
+def _explain(path: Path, error: OSError) -> str:
+    if not path.parent.is_dir():
+        return f"no directory {path.parent} for the bus unix:{path}; create it first"
+    return f"cannot listen at unix:{path}: {error.strerror or error}"
+
+
+@contextmanager
+def _directory_locked(directory: Path) -> Iterator[None]:
+    """Keep two emulators that start at once from removing each other's socket."""
+    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove the socket file of an emulator that is no more.
+
+    Raises:
+        SimError: If it lives, or the file is no socket.
+    """
+    if not os.path.lexists(path):
+        return
+    if not path.is_socket():
+        raise SimError(f"cannot listen at unix:{path}: a file that is no socket is in the way")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink()
+            return
+        except BlockingIOError:
+            pass  # alive, its queue of newcomers full
+    raise SimError(f"another emulator already listens on {path}")

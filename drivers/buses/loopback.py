@@ -15,8 +15,10 @@ class LoopbackBus(Bus):
     Example:
         >>> bus = LoopbackBus()
         >>> bus.connect(bus.deliver)  # everything sent comes back
-        >>> bus.send(bytes(16)), bus.recv(0.0)
-        (True, b'\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00')
+        >>> bus.send(bytes(16))
+        True
+        >>> bus.recv(0.0) == bytes(16)
+        True
     """
 
     def __init__(self) -> None:

@@ -212,7 +212,7 @@ def pack_heartbeat(state: NmtState) -> bytes:
 
 
 def parse_heartbeat(data: bytes) -> NmtState | None:
-    """Return the state in a heartbeat, None if it is not one. Bit 7 (guarding toggle) is ignored."""
+    """Return the state in a heartbeat, None if it is none. Bit 7 (guarding toggle) is ignored."""
     return _NMT_STATES.get(data[0] & 0x7F) if len(data) == 1 else None
 
 

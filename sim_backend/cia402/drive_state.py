@@ -10,7 +10,7 @@ from drivers.cia402.codec import Cia402State
 _S = Cia402State
 FAULT_RESET_BIT = 0x80
 STAYS_IN_QUICK_STOP = 5
-"""Quick stop options (605A) from here on stay in QUICK STOP ACTIVE; lower ones go on by themselves."""
+"""Quick stop options (605A) from here on stay in QUICK STOP ACTIVE; lower ones leave it."""
 
 
 class Command(IntEnum):
@@ -87,7 +87,8 @@ class DriveStateMachine:
 
     def initialise(self) -> None:
         """Transitions 0 and 1: self-test passed, ready for the first command."""
-        self.__init__()  # type: ignore[misc]
+        self.controlword = 0
+        self._is_resume_blocked = False
         self.state = _S.SWITCH_ON_DISABLED
 
     def command(self, controlword: int) -> None:
@@ -130,10 +131,8 @@ class DriveStateMachine:
             self.state = _S.FAULT_REACTION_ACTIVE
 
     def settle(self) -> None:
-        """Make the transitions the drive makes by itself: 14, and 12 after a finished quick stop."""
+        """Make the transitions the drive makes by itself: 14, and 12 after a quick stop."""
         if self.state is _S.FAULT_REACTION_ACTIVE:
             self.state = _S.FAULT
-        elif (
-            self.state is _S.QUICK_STOP_ACTIVE and self.quick_stop_option < STAYS_IN_QUICK_STOP
-        ):
+        elif self.state is _S.QUICK_STOP_ACTIVE and self.quick_stop_option < STAYS_IN_QUICK_STOP:
             self.state = _S.SWITCH_ON_DISABLED

@@ -99,10 +99,9 @@ def truth(name: str) -> list[list[float]]:
 
 def measure(name: str, substep_s: float, build: Callable[[PlantSettings], Arm] = Arm) -> Errors:
     case = CASES[name]
-    plant = TwoLink(case.plant)
     arm = build(case.settings(substep_s))
     arm.reset(case.start[:2], case.start[2:])
-    start_J, rest_J = arm.energy_J(), plant.energy_J((0.0, 0.0, 0.0, 0.0))
+    start_J, rest_J = arm.energy_J(), TwoLink(case.plant).energy_J((0.0, 0.0, 0.0, 0.0))
     q = q_first = dq = energy = separation = 0.0
     for k, y in enumerate(truth(name)):
         tau = case.law(k * PERIOD_S, (*arm.q_rad, *arm.dq_rad_s))
@@ -115,7 +114,8 @@ def measure(name: str, substep_s: float, build: Callable[[PlantSettings], Arm] =
             separation = max(separation, arm.joint_separation_m())
         if k == 999:
             q_first = q
-    return Errors(q, q_first, dq, energy / (start_J - rest_J), separation)
+    is_free = case.law is free
+    return Errors(q, q_first, dq, energy / (start_J - rest_J) if is_free else 0.0, separation)
 
 
 class DefaultBias(Arm):

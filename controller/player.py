@@ -1,0 +1,138 @@
+"""Plays a compiled reference: the loop only indexes; a stop slows down along the path."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+STOP_SHAPE_PEAK = 1.875
+"""Peak slope of the quintic step in `_speed`, for a step of one over a duration of one."""
+
+
+class Setpoint(NamedTuple):
+    """Reference of one cycle, per joint."""
+
+    q_rad: list[float]
+    dq_rad_s: list[float]
+    ddq_rad_s2: list[float]
+
+
+class ReferencePlayer:
+    """The reference in force: a pose that is held, or a compiled motion being indexed.
+
+    A motion is a flat view of doubles, one row a period: q, dq, ddq of all joints.
+
+    Attributes:
+        setpoint: The reference of the last step.
+        t_ref_s: Time along the running motion, 0 when none runs.
+    """
+
+    def __init__(self, joints: int, period_s: float) -> None:
+        self._joints = joints
+        self._period_s = period_s
+        self._rows: Sequence[float] | None = None
+        self._last = 0
+        self._phase = 0.0
+        self._speed = 1.0
+        self._stop_elapsed_s = 0.0
+        self._stop_duration_s = 0.0
+        self.t_ref_s = 0.0
+        zeros = [0.0] * joints
+        self.setpoint = Setpoint(zeros, zeros, zeros)
+
+    @property
+    def is_moving(self) -> bool:
+        """True while a motion is being played."""
+        return self._rows is not None
+
+    @property
+    def is_stopping(self) -> bool:
+        """True while a motion is being slowed down to rest."""
+        return self._stop_duration_s > 0.0
+
+    @property
+    def index(self) -> int:
+        """Row of the motion that was played last."""
+        return int(self._phase)
+
+    def hold(self, q_rad: Sequence[float]) -> None:
+        """Drop any motion and hold a pose."""
+        zeros = [0.0] * self._joints
+        self.setpoint = Setpoint(list(q_rad), zeros, zeros)
+        self._end()
+
+    def start(self, rows: Sequence[float], samples: int) -> None:
+        """Play a motion from its first row, which the next step returns.
+
+        Args:
+            rows: Flat doubles, `samples` rows of q, dq, ddq for all joints; kept, not copied.
+            samples: Number of rows, at least 1.
+        """
+        self._end()
+        self._rows = rows
+        self._last = samples - 1
+        self._phase = -1.0
+
+    def stop(self, ddq_max_rad_s2: Sequence[float]) -> None:
+        """Slow down along the path, so that braking alone stays within these accelerations."""
+        if self._rows is None or self.is_stopping:
+            return
+        slowest = max(
+            abs(dq) / limit
+            for dq, limit in zip(self.setpoint.dq_rad_s, ddq_max_rad_s2, strict=True)
+        )
+        self._stop_duration_s = max(STOP_SHAPE_PEAK * slowest, 10 * self._period_s)
+        self._stop_elapsed_s = 0.0
+
+    def step(self, periods: int) -> Setpoint:
+        """Advance by whole periods and return the reference of this cycle.
+
+        Args:
+            periods: 1, or more after skipped periods. A motion that has ended holds its last row.
+        """
+        if self._rows is None:
+            return self.setpoint
+        if self.is_stopping:
+            return self._step_stopping(periods)
+        self._phase = min(self._phase + periods, float(self._last))
+        self.t_ref_s = self._phase * self._period_s
+        self.setpoint = self._row(int(self._phase))
+        if self._phase >= self._last:
+            self.hold(self.setpoint.q_rad)
+        return self.setpoint
+
+    def _step_stopping(self, periods: int) -> Setpoint:
+        dt_s = periods * self._period_s
+        before = self._speed
+        self._stop_elapsed_s += dt_s
+        x = min(1.0, self._stop_elapsed_s / self._stop_duration_s)
+        self._speed = 1.0 - x * x * x * (10.0 - 15.0 * x + 6.0 * x * x)
+        self._phase = min(self._phase + 0.5 * (before + self._speed) * periods, float(self._last))
+        row = int(self._phase)
+        q, dq, ddq = self._row(row)
+        ahead_s = (self._phase - row) * self._period_s
+        v, dv = self._speed, (self._speed - before) / dt_s
+        path = [
+            (a + ahead_s * (b + 0.5 * ahead_s * c), b + ahead_s * c, c)
+            for a, b, c in zip(q, dq, ddq, strict=True)
+        ]
+        self.t_ref_s = self._phase * self._period_s
+        self.setpoint = Setpoint(
+            [a for a, _, _ in path], [b * v for _, b, _ in path], [c * v * v + b * dv for _, b, c in path]
+        )
+        if x >= 1.0 or self._phase >= self._last:
+            self.hold(self.setpoint.q_rad)
+        return self.setpoint
+
+    def _row(self, index: int) -> Setpoint:
+        assert self._rows is not None  # noqa: S101 - only called while a motion is played
+        n = self._joints
+        start = index * 3 * n
+        row = list(self._rows[start : start + 3 * n])
+        return Setpoint(row[:n], row[n : 2 * n], row[2 * n :])
+
+    def _end(self) -> None:
+        self._rows = None
+        self._speed = 1.0
+        self._stop_duration_s = 0.0
+        self.t_ref_s = 0.0
+
+

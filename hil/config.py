@@ -1,0 +1,291 @@
+"""The configuration: one TOML file, validated; command line > environment > file > default.
+
+What the file leaves out comes from the arm preset. Environment variables are `HIL_` plus the
+setting's path with `__` between the parts, for example `HIL_LOOP__REALTIME=best_effort`.
+"""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+)
+
+from controller.settings import ControllerSettings
+from drivers.bus import split_address
+from drivers.errors import DriverError
+from drivers.registry import AnyAxisSettings
+from hil.errors import HilError
+from sim_backend.errors import SimError
+from sim_backend.presets import plant_preset, servo_preset
+from sim_backend.settings import EmulatorSettings, PlantSettings, ServoSettings
+
+DEFAULT_PRESET = "bench_h"
+
+
+class ConfigError(HilError):
+    """The configuration cannot be used; the message says which setting and why."""
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ArmSettings(_Settings):
+    """Which arm this is."""
+
+    name: str = Field("bench", pattern=r"^[A-Za-z0-9_-]{1,32}$", description="Zenoh: hil/NAME/...")
+    preset: str = Field(DEFAULT_PRESET, description="source of every setting left out")
+
+
+class BusSettings(_Settings):
+    """The bus the amplifiers are on."""
+
+    address: str = Field("unix:/tmp/hil-bench.sock", description="see `hil run --help`")
+    bit_rate: int = Field(1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the budget")
+
+
+class LoopSettings(_Settings):
+    """The control loop's timing and rights."""
+
+    period_s: float = Field(1e-3, ge=1e-3, le=10e-3)
+    realtime: Literal["required", "best_effort", "off"] = Field(
+        "required", description="SCHED_FIFO, locked memory; `required` fails when not granted"
+    )
+    priority: int = Field(80, ge=1, le=98)
+    cpu: int | None = Field(None, ge=0, description="core to run on; none = any")
+    feedback_timeout_s: float = Field(
+        0.6e-3, gt=0, description="after the start of a cycle; later feedback is missing"
+    )
+    enable_timeout_s: float = Field(1.0, gt=0)
+    on_gateway_loss: Literal["finish", "hold", "stop"] = Field(
+        "finish", description="finish: the trajectory, then hold; hold: slow down now; stop: damped"
+    )
+
+
+class TrajectorySettings(_Settings):
+    """What may be sent as one trajectory."""
+
+    max_duration_s: float = Field(120.0, gt=0, le=3600)
+
+
+class ZenohSettings(_Settings):
+    """How clients reach the daemon."""
+
+    mode: Literal["peer", "client", "router"] = "peer"
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    connect: tuple[str, ...] = ()
+    multicast_scouting: bool = False
+
+
+class RecordingSettings(_Settings):
+    """Where runs are recorded."""
+
+    directory: str = "runs"
+    is_enabled: bool = True
+
+
+class Config(BaseSettings):
+    """Everything that can be set. Per-joint lists have one entry per joint, shoulder first."""
+
+    model_config = SettingsConfigDict(
+        extra="forbid",
+        frozen=True,
+        env_prefix="HIL_",
+        env_nested_delimiter="__",
+        allow_inf_nan=False,
+    )
+
+    arm: ArmSettings = ArmSettings()
+    bus: BusSettings = BusSettings()
+    axes: tuple[AnyAxisSettings, ...] = Field(min_length=1)
+    controller: ControllerSettings
+    loop: LoopSettings = LoopSettings()
+    trajectory: TrajectorySettings = TrajectorySettings()
+    zenoh: ZenohSettings = ZenohSettings()
+    recording: RecordingSettings = RecordingSettings()
+    plant: PlantSettings = Field(description="the emulated arm")
+    servos: tuple[ServoSettings, ...] = Field(description="the emulated motors")
+    emulator: EmulatorSettings = EmulatorSettings()
+    scenario: str | None = Field(None, description="name of the reference scenario being run")
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Take only what is given: `load_config` lays file, environment and command line together."""
+        del settings_cls, env_settings, dotenv_settings, file_secret_settings
+        return (init_settings,)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_from_preset(cls, data: dict[str, Any]) -> dict[str, Any]:
+        arm = data.get("arm") or {}
+        name = arm.get("preset", DEFAULT_PRESET) if isinstance(arm, Mapping) else DEFAULT_PRESET
+        try:
+            return merge(preset_defaults(str(name)), data)
+        except SimError as error:
+            raise ValueError(str(error)) from error
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        joints = self.joints
+        for name, given in (("plant.links", self.plant.links), ("servos", self.servos),
+                            ("plant.q0_rad", self.plant.q0_rad)):  # fmt: skip
+            if len(given) != joints:
+                raise ValueError(f"{name} has {len(given)} entries, axes has {joints}")
+        self.controller.require_joints(joints)
+        nodes = [axis.node_id for axis in self.axes]
+        if len(set(nodes)) != joints:
+            raise ValueError(f"axes: node ids {nodes} are not all different")
+        if self.loop.feedback_timeout_s >= self.loop.period_s:
+            raise ValueError("loop.feedback_timeout_s must be shorter than loop.period_s")
+        return self
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self.axes)
+
+
+def preset_defaults(name: str) -> dict[str, Any]:
+    """Return what an arm preset says about every setting that has no default of its own.
+
+    Raises:
+        SimError: If there is no such preset.
+    """
+    plant, servos = plant_preset(name), servo_preset(name)
+    tau_max = [servo.torque_constant_Nm_A * servo.current_max_A for servo in servos]
+    n = len(servos)
+    limits = {
+        "q_min_rad": [-2.8] * n,
+        "q_max_rad": [2.8] * n,
+        "dq_max_rad_s": [15.0] * n,
+        "ddq_max_rad_s2": [60.0] * n,
+        "dddq_max_rad_s3": [2000.0] * n,
+        "tau_max_Nm": tau_max,
+        "tau_slew_Nm_s": [500.0 * tau for tau in tau_max],
+        "following_error_rad": [0.8] * n,
+        "damping_Nms_rad": [1.0] * n,
+    }
+    axes = [
+        {"family": "cia402", "node_id": j, "rated_torque_Nm": round(tau / 3.0, 3), "torque_max_Nm": tau}
+        for j, tau in enumerate(tau_max, start=1)
+    ]
+    return {
+        "arm": {"preset": name},
+        "axes": axes,
+        "controller": {"limits": limits},
+        "plant": plant.model_dump(),
+        "servos": [servo.model_dump() for servo in servos],
+    }
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with `over` laid on it; tables are merged, everything else is replaced.
+
+    A table with integer keys laid on a list changes single entries: `{"1": {...}}`.
+    """
+    merged = dict(base)
+    for key, value in over.items():
+        below = merged.get(key)
+        if isinstance(value, Mapping) and isinstance(below, Mapping):
+            merged[key] = merge(below, value)
+        elif isinstance(value, Mapping) and isinstance(below, (list, tuple)):
+            merged[key] = _merge_entries(key, below, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _merge_entries(
+    key: str, below: list[Any] | tuple[Any, ...], over: Mapping[str, Any]
+) -> list[Any]:
+    entries = list(below)
+    for place, value in over.items():
+        if not place.isdigit() or not 1 <= int(place) <= len(entries):
+            raise ValueError(f"{key}.{place}: entries are numbered 1 to {len(entries)}")
+        entry = entries[int(place) - 1]
+        is_table = isinstance(value, Mapping) and isinstance(entry, Mapping)
+        entries[int(place) - 1] = merge(entry, value) if is_table else value
+    return entries
+
+
+def parse_assignment(text: str) -> dict[str, Any]:
+    """Turn `table.key=value` into a nested table; the value is read as TOML, else as text.
+
+    Raises:
+        ConfigError: If there is no `=` or no key.
+    """
+    path, equals, raw = text.partition("=")
+    if not equals or not all(path.split(".")):
+        raise ConfigError(f"--set {text!r}: write table.key=value, for example loop.cpu=1")
+    try:
+        value: Any = tomllib.loads(f"v = {raw}")["v"]
+    except tomllib.TOMLDecodeError:
+        value = raw
+    for part in reversed(path.split(".")):
+        value = {part: value}
+    table: dict[str, Any] = value
+    return table
+
+
+def load_config(
+    path: str | None = None, overrides: Mapping[str, Any] | None = None
+) -> Config:
+    """Read and validate the configuration.
+
+    Args:
+        path: TOML file, or none for presets and defaults alone.
+        overrides: From the command line; they win over everything.
+
+    Raises:
+        ConfigError: With one line that names the file, the setting, the value and the reason.
+    """
+    source = path or "configuration"
+    data = _read_toml(path) if path else {}
+    try:
+        config = Config(**merge(merge(data, EnvSettingsSource(Config)()), overrides or {}))
+        split_address(config.bus.address)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {_first_problem(error)}") from error
+    except (ValueError, DriverError) as error:
+        raise ConfigError(f"{source}: {error}") from error
+    return config
+
+
+def config_from_json(text: str | bytes) -> Config:
+    """Rebuild a configuration that `Config.model_dump_json` wrote; the environment is not asked."""
+    return Config.model_validate_json(text)
+
+
+def _read_toml(path: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+
+
+def _first_problem(error: ValidationError) -> str:
+    problems = error.errors(include_url=False)
+    first = problems[0]
+    where = ".".join(str(part) for part in first["loc"])
+    value = first.get("input")
+    shown = "" if isinstance(value, (Mapping, list, tuple)) else f" (got {json.dumps(value, default=str)})"
+    more = f"; and {len(problems) - 1} more" if len(problems) > 1 else ""
+    message = first["msg"].removeprefix("Value error, ")
+    return f"{where + ': ' if where else ''}{message}{shown}{more}"

@@ -1,0 +1,334 @@
+"""One control cycle: feedback -> estimate -> law -> limits -> torque commands.
+
+The same code runs in the real-time process and in the virtual-time simulation; time and the bus
+are given to it. Nothing in here waits except for feedback, and that until a deadline.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from controller.errors import CommandError
+from controller.faults import FaultCode, Reaction
+from controller.law import PassivityLaw
+from controller.limits import MotionGuard, TorqueLimiter
+from controller.machine import Machine, State, Trigger
+from controller.player import ReferencePlayer, Setpoint
+from controller.velocity import make_estimator
+from drivers.arm_bus import ArmBus
+from drivers.axis import AxisStatus
+from drivers.errors import BusError
+from hil.config import Config
+
+AT_REST_RAD_S = 0.05
+"""A damped stop ends when every joint is slower than this."""
+
+EventSink = Callable[[str, Mapping[str, Any]], None]
+"""Takes an event's kind and its details."""
+
+
+class Control:
+    """The controller of one arm, cycle by cycle.
+
+    Attributes:
+        machine: State and latched fault.
+        player: The reference in force.
+        law: The control law; its gains' bounds can be moved.
+        overruns: Skipped periods so far.
+        q_rad: Joint angles used in the last cycle.
+        dq_rad_s: Joint rates used in the last cycle.
+        tau_cmd_Nm: Torques the law requested in the last cycle.
+        tau_sent_Nm: Torques sent in the last cycle.
+        feedback_ns: When the last feedback frame of the cycle had been taken.
+        law_ns: When law and limits were done.
+    """
+
+    def __init__(
+        self, config: Config, bus: ArmBus, *, now_ns: Callable[[], int], events: EventSink
+    ) -> None:
+        settings, n = config.controller, config.joints
+        self.machine = Machine()
+        self.player = ReferencePlayer(n, config.loop.period_s)
+        self.law = PassivityLaw(settings.law, settings.limits.tau_max_Nm)
+        self.overruns = 0
+        self.q_rad = [0.0] * n
+        self.dq_rad_s = [0.0] * n
+        self.tau_cmd_Nm = [0.0] * n
+        self.tau_sent_Nm = [0.0] * n
+        self.feedback_ns = 0
+        self.law_ns = 0
+        self._bus = bus
+        self._now_ns = now_ns
+        self._events = events
+        self._period_s = config.loop.period_s
+        self._limits = settings.limits
+        self._limiter = TorqueLimiter(settings.limits)
+        self._guard = MotionGuard(settings.limits)
+        self._estimator = make_estimator(settings.velocity, n)
+        self._zeros = [0.0] * n
+        self._enable_cycles = round(config.loop.enable_timeout_s / self._period_s)
+        self._stop_cycles = round(settings.limits.stop_timeout_s / self._period_s)
+        self._enabling_left = 0
+        self._stopping_left = 0
+        self._has_feedback = False
+        self._dt_s = 0.0
+        self._age = 0
+
+    # --- the cycle --------------------------------------------------------------------------
+
+    def step(self, deadline_ns: int, periods: int) -> None:
+        """Run one cycle.
+
+        Args:
+            deadline_ns: Feedback that is not there by then is missing in this cycle.
+            periods: Periods since the last cycle, 1 unless some were skipped.
+
+        Raises:
+            BusError: If the bus is gone. The fault is latched; torque cannot be commanded.
+        """
+        if periods > 1:
+            self.overruns += periods - 1
+        try:
+            self._bus.request_feedback()
+            is_fresh = self._bus.collect(deadline_ns)
+        except BusError:
+            self._trip(FaultCode.BUS_FAILED)
+            raise
+        self.feedback_ns = self._now_ns()
+        self._take_feedback(is_fresh, periods)
+        self._check_amplifiers()
+        torques = self._torques(periods)
+        self.law_ns = self._now_ns()
+        self.tau_sent_Nm = torques
+        self._bus.send_torques(torques)
+
+    def _take_feedback(self, is_fresh: bool, periods: int) -> None:
+        self._dt_s += periods * self._period_s
+        if not is_fresh:
+            self._age += 1
+            return
+        self._age = 0
+        q = [axis.q_rad for axis in self._bus.axes]
+        if self._has_feedback:
+            self.dq_rad_s = self._estimator.step(q, self._dt_s)
+        else:
+            self._estimator.reset(q)
+            self._has_feedback = True
+        self.q_rad = q
+
+    def _torques(self, periods: int) -> list[float]:
+        state = self.machine.state
+        if state.is_powered:
+            if self._age:
+                return self._bridge_gap()
+            if state is State.STOPPING:
+                return self._damp()
+            return self._control(periods)
+        if self._enabling_left and not self._age:
+            if self._power_on():
+                return self._control(periods)
+        elif not self._age:
+            self.player.hold(self.q_rad)
+        self._dt_s = 0.0
+        return self._rest()
+
+    def _rest(self) -> list[float]:
+        self.tau_cmd_Nm = self._zeros
+        self._limiter.reset()
+        return self._zeros
+
+    def _control(self, periods: int) -> list[float]:
+        """Reference, law, limits, in a state in which the law has power."""
+        dt_s, self._dt_s = self._dt_s, 0.0
+        was_moving = self.player.is_moving
+        setpoint = self.player.step(periods)
+        if was_moving and not self.player.is_moving and self.machine.state is State.ACTIVE:
+            self.fire(Trigger.FINISHED)
+        code = self._violation(setpoint)
+        if code is not FaultCode.NONE:
+            self._trip(code, **self._explain(code))
+            return self._damp() if self.machine.state is State.STOPPING else self._rest()
+        q_des, dq_des, _ = setpoint
+        self.tau_cmd_Nm = self.law.step(self.q_rad, self.dq_rad_s, q_des, dq_des, dt_s)
+        try:
+            return self._limiter.step(self.tau_cmd_Nm, dt_s)
+        except CommandError as error:
+            self._trip(FaultCode.NOT_FINITE, detail=str(error))
+            return self._rest()
+
+    def _violation(self, setpoint: Setpoint) -> FaultCode:
+        if not self._estimator.is_locked:
+            return FaultCode.ESTIMATOR_LOST
+        return self._guard.check(self.q_rad, self.dq_rad_s, setpoint.q_rad)
+
+    def _explain(self, code: FaultCode) -> dict[str, Any]:
+        if code is FaultCode.ESTIMATOR_LOST:
+            return {"detail": "the velocity estimate lost the encoder; raise C or slow down"}
+        guard = self._guard
+        return {"joint": guard.joint, "value": guard.value, "limit": guard.limit}
+
+    def _damp(self) -> list[float]:
+        """Torque against the motion; power goes off at rest or after the time allowed."""
+        self._stopping_left -= 1
+        is_at_rest = all(abs(dq) < AT_REST_RAD_S for dq in self.dq_rad_s)
+        self.player.hold(self.q_rad)
+        if is_at_rest or self._stopping_left <= 0:
+            self.fire(Trigger.AT_REST)
+            return self._rest()
+        dt_s, self._dt_s = self._dt_s, 0.0
+        damping = self._limits.damping_Nms_rad
+        self.tau_cmd_Nm = [-d * dq for d, dq in zip(damping, self.dq_rad_s, strict=True)]
+        return self._limiter.step(self.tau_cmd_Nm, dt_s)
+
+    def _bridge_gap(self) -> list[float]:
+        """Feedback is missing: hold the last torque, then damp, then give up."""
+        if self._age <= self._limits.n_hold:
+            return self.tau_sent_Nm
+        if self._age <= self._limits.n_hold + self._limits.n_damp:
+            return [
+                0.0 if axis.age_cycles else -d * dq
+                for axis, d, dq in zip(
+                    self._bus.axes, self._limits.damping_Nms_rad, self.dq_rad_s, strict=True
+                )
+            ]
+        silent = next(axis for axis in self._bus.axes if axis.age_cycles)
+        self._trip(FaultCode.FEEDBACK_LOST, detail=f"{silent.label}: silent for {self._age} cycles")
+        return self._rest()
+
+    # --- power and faults -------------------------------------------------------------------
+
+    def _power_on(self) -> bool:
+        self._enabling_left -= 1
+        self.player.hold(self.q_rad)
+        if self._bus.is_enabled:
+            self._enabling_left = 0
+            self.law.reset()
+            self.fire(Trigger.POWERED)
+            return True
+        if self._enabling_left == 0:
+            waiting = next(a for a in self._bus.axes if a.status is not AxisStatus.ENABLED)
+            self._trip(FaultCode.ENABLE_TIMEOUT, detail=f"{waiting.label} is not enabled in time")
+        return False
+
+    def _check_amplifiers(self) -> None:
+        if self._bus.is_enabled or self.machine.fault is not FaultCode.NONE:
+            return
+        broken = self._bus.first_in(AxisStatus.FAULT)
+        lost = self._bus.first_in(AxisStatus.LOST)
+        dropped = self._bus.first_in(AxisStatus.DISABLED)
+        if broken is not None:
+            self._trip(FaultCode.AMPLIFIER_FAULT, detail=broken.note)
+        elif lost is not None:
+            self._trip(FaultCode.AMPLIFIER_LOST, detail=lost.note)
+        elif dropped is not None and self.machine.state.is_powered:
+            self._trip(FaultCode.AMPLIFIER_FAULT, detail=f"{dropped.label}: disabled by itself")
+
+    def trip(self, code: FaultCode, **detail: object) -> None:
+        """Latch a fault found outside the cycle (lost supervisor, internal error)."""
+        self._trip(code, **detail)
+
+    def _trip(self, code: FaultCode, **detail: object) -> None:
+        before = self.machine.state
+        reaction = self.machine.trip(code)
+        self._events("fault", {"code": code.name, "reaction": reaction.name, **detail})
+        if reaction is Reaction.HOLD:
+            self.player.stop(self._limits.ddq_max_rad_s2)
+        self._entered(before)
+
+    def fire(self, trigger: Trigger) -> None:
+        """Change state by the transition table.
+
+        Raises:
+            CommandError: If the table has no such change. Nothing has changed.
+        """
+        before = self.machine.state
+        self.machine.fire(trigger)
+        self._entered(before)
+
+    def _entered(self, before: State) -> None:
+        state = self.machine.state
+        if state is before:
+            return
+        self._events("state", {"from": before.name, "to": state.name})
+        if state is State.STOPPING:
+            self._stopping_left = self._stop_cycles
+        if not state.is_powered:
+            self._enabling_left = 0
+            self.player.hold(self.q_rad)
+            for axis in self._bus.axes:
+                axis.disable()
+
+    # --- commands; each raises CommandError with the reason if refused, and then changes nothing
+
+    def enable(self) -> None:
+        """Ask the amplifiers for power; READY follows when all have it."""
+        state = self.machine.state
+        if state is not State.IDLE:
+            remedy = "; reset first" if state in (State.FAULT, State.ESTOP) else ""
+            raise CommandError(f"enable is not possible in state {state.name}{remedy}")
+        self._enabling_left = self._enable_cycles
+        for axis in self._bus.axes:
+            axis.enable()
+
+    def disable(self) -> None:
+        """Damped stop, then torque off. In IDLE nothing is to be done."""
+        if self.machine.state is State.IDLE:
+            self._enabling_left = 0
+            for axis in self._bus.axes:
+                axis.disable()
+        elif self.machine.state is not State.STOPPING:
+            self.fire(Trigger.DISABLE)
+
+    def start(self, rows: Sequence[float], samples: int, *, at_index: int | None) -> None:
+        """Play a compiled reference from now on.
+
+        Args:
+            rows: See `ReferencePlayer.start`.
+            samples: Number of rows.
+            at_index: Row of the running motion at which this one continues it; None if the
+                reference must be at rest.
+        """
+        player = self.player
+        if not self.machine.can(Trigger.TRAJECTORY):
+            remedy = "; enable first" if self.machine.state is State.IDLE else ""
+            raise CommandError(
+                f"a trajectory is not possible in state {self.machine.state.name}{remedy}"
+            )
+        if player.is_stopping:
+            raise CommandError("the arm is being stopped; send the trajectory when it is at rest")
+        if player.is_moving != (at_index is not None):
+            raise CommandError("the reference has changed since this trajectory was planned")
+        if at_index is not None and at_index != player.index + 1:
+            raise CommandError("the trajectory came too late to continue the running one")
+        player.start(rows, samples)
+        self.fire(Trigger.TRAJECTORY)
+
+    def stop(self) -> None:
+        """Slow the running motion down along its path and hold; power stays on."""
+        if self.machine.state not in (State.READY, State.ACTIVE, State.HOLD):
+            raise CommandError(f"stop is not possible in state {self.machine.state.name}")
+        self.player.stop(self._limits.ddq_max_rad_s2)
+
+    def estop(self) -> None:
+        """Torque off in this cycle; latched until reset."""
+        if self.machine.state is not State.ESTOP:
+            self.fire(Trigger.ESTOP)
+
+    def reset(self) -> None:
+        """Clear a latched fault or emergency stop; the amplifiers stay disabled."""
+        if not self.machine.can(Trigger.RESET):
+            raise CommandError(f"there is nothing to reset in state {self.machine.state.name}")
+        for axis in self._bus.axes:
+            if axis.status in (AxisStatus.FAULT, AxisStatus.LOST):
+                axis.reset_fault()
+                axis.status = AxisStatus.DISABLED
+        self.fire(Trigger.RESET)
+
+    def set_gain_bounds(self, Kd_min: Sequence[float], Kd_max: Sequence[float]) -> None:
+        """Let the gain bounds of every joint ramp to new values, checked beforehand."""
+        for gain, low, high in zip(self.law.gains, Kd_min, Kd_max, strict=True):
+            gain.set_bounds(low, high)
+
+    def inject_fault(self, joint: int) -> None:
+        """Put the emulated amplifier of a joint (from 1) into fault."""
+        if not self._bus.inject_fault(joint - 1):
+            raise CommandError(f"the amplifier of joint {joint} has no fault injection")
