@@ -116,7 +116,9 @@ class ReferencePlayer:
         ]
         self.t_ref_s = self._phase * self._period_s
         self.setpoint = Setpoint(
-            [a for a, _, _ in path], [b * v for _, b, _ in path], [c * v * v + b * dv for _, b, c in path]
+            [a for a, _, _ in path],
+            [b * v for _, b, _ in path],
+            [c * v * v + b * dv for _, b, c in path],
         )
         if x >= 1.0 or self._phase >= self._last:
             self.hold(self.setpoint.q_rad)
@@ -134,5 +136,3 @@ class ReferencePlayer:
         self._speed = 1.0
         self._stop_duration_s = 0.0
         self.t_ref_s = 0.0
-
-

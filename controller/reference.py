@@ -9,14 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.errors import TrajectoryError
+from controller.settings import LimitSettings
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
-Quantity: TypeAlias = Literal["position", "velocity", "acceleration"]
+Quantity: TypeAlias = Literal["position", "velocity", "acceleration", "jerk"]
 
 _UNITS: dict[Quantity, str] = {
     "position": "rad",
     "velocity": "rad/s",
     "acceleration": "rad/s^2",
+    "jerk": "rad/s^3",
 }
 _TOLERANCE = 1e-9  # of 1 + |limit|: rounding in a reference that runs along its limit
 _AT_REST = 1e-9  # rad/s, rad/s^2
@@ -58,7 +60,8 @@ class MotionLimits:
         q_max_rad: Soft upper limit of the joint angle.
         dq_max_rad_s: Largest speed, > 0.
         ddq_max_rad_s2: Largest acceleration, > 0.
-        dddq_max_rad_s3: Largest jerk of limit-aware moves, > 0.
+        dddq_max_rad_s3: Largest jerk of moves, approaches and braking, > 0; trajectories may
+            exceed it.
         following_error_rad: Largest distance between reference and joint.
         max_duration_s: Longest reference, approach and final braking included.
     """
@@ -70,6 +73,19 @@ class MotionLimits:
     dddq_max_rad_s3: tuple[float, ...]
     following_error_rad: tuple[float, ...]
     max_duration_s: float
+
+    @classmethod
+    def of(cls, settings: LimitSettings, max_duration_s: float) -> "MotionLimits":
+        """Take the limits of a reference from the arm's settings."""
+        return cls(
+            settings.q_min_rad,
+            settings.q_max_rad,
+            settings.dq_max_rad_s,
+            settings.ddq_max_rad_s2,
+            settings.dddq_max_rad_s3,
+            settings.following_error_rad,
+            max_duration_s,
+        )
 
     @property
     def joints(self) -> int:
@@ -183,35 +199,42 @@ class Reference:
         """Return the motion at a sample; negative numbers count from the end."""
         return MotionState(self.q_rad[sample], self.dq_rad_s[sample], self.ddq_rad_s2[sample])
 
-    def check(self, limits: MotionLimits) -> Violation | None:
+    def check(self, limits: MotionLimits, *, with_jerk: bool = False) -> Violation | None:
         """Return the first violation of the position, velocity and acceleration limits, or None.
 
         Besides the samples, the mean velocity and mean acceleration over every period are
         checked, so that nothing can hide between two samples. A NaN is a violation.
+
+        Args:
+            limits: For the same number of joints.
+            with_jerk: Check the mean jerk over every period, too.
 
         Raises:
             TrajectoryError: If the limits are for another number of joints.
         """
         if limits.joints != self.joints:
             raise TrajectoryError(f"limits of {limits.joints} joints, {self.joints} in reference")
-        speed = np.asarray(limits.dq_max_rad_s)
-        rate = np.asarray(limits.ddq_max_rad_s2)
-        q_range = np.asarray(limits.q_min_rad), np.asarray(limits.q_max_rad)
-        found = (
-            self._first("position", self.q_rad, q_range),
-            self._first("velocity", self.dq_rad_s, (-speed, speed)),
-            self._first("velocity", np.diff(self.q_rad, axis=0) / self.period_s, (-speed, speed)),
-            self._first("acceleration", self.ddq_rad_s2, (-rate, rate)),
-            self._first(
-                "acceleration", np.diff(self.dq_rad_s, axis=0) / self.period_s, (-rate, rate)
-            ),
-        )
+        low, high = np.asarray(limits.q_min_rad), np.asarray(limits.q_max_rad)
+        found = [self._first("position", self.q_rad, low, high)]
+        checks: list[tuple[Quantity, FloatArray, tuple[float, ...]]] = [
+            ("velocity", self.dq_rad_s, limits.dq_max_rad_s),
+            ("velocity", self._slope(self.q_rad), limits.dq_max_rad_s),
+            ("acceleration", self.ddq_rad_s2, limits.ddq_max_rad_s2),
+            ("acceleration", self._slope(self.dq_rad_s), limits.ddq_max_rad_s2),
+        ]
+        if with_jerk:
+            checks.append(("jerk", self._slope(self.ddq_rad_s2), limits.dddq_max_rad_s3))
+        for quantity, values, most in checks:
+            bound = np.asarray(most)
+            found.append(self._first(quantity, values, -bound, bound))
         return min((v for v in found if v is not None), key=lambda v: v.time_s, default=None)
 
+    def _slope(self, values: FloatArray) -> FloatArray:
+        return np.diff(values, axis=0) / np.float64(self.period_s)
+
     def _first(
-        self, quantity: Quantity, values: FloatArray, bounds: tuple[FloatArray, FloatArray]
+        self, quantity: Quantity, values: FloatArray, low: FloatArray, high: FloatArray
     ) -> Violation | None:
-        low, high = bounds
         is_inside = values >= low - _TOLERANCE * (1.0 + np.abs(low))  # False for NaN
         is_inside &= values <= high + _TOLERANCE * (1.0 + np.abs(high))
         if is_inside.all():

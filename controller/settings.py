@@ -1,5 +1,6 @@
 """What can be set of the controller. Lists have one entry per joint, shoulder first."""
 
+from collections.abc import Iterable
 from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -12,7 +13,7 @@ class _Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-def _require_lengths(settings: BaseModel, names: tuple[str, ...], joints: int) -> None:
+def _require_lengths(settings: BaseModel, names: Iterable[str], joints: int) -> None:
     for name in names:
         given = len(getattr(settings, name))
         if given != joints:
@@ -64,8 +65,8 @@ class LawSettings(_Settings):
         for j, (low, high) in enumerate(zip(self.Kd_min, self.Kd_max, strict=True), start=1):
             if not self.Kd_floor <= low <= high <= self.Kd_ceiling:
                 raise ValueError(
-                    f"joint {j}: gain bounds ({low:g}, {high:g}) must satisfy "
-                    f"Kd_floor {self.Kd_floor:g} <= Kd_min <= Kd_max <= Kd_ceiling {self.Kd_ceiling:g}"
+                    f"joint {j}: gain bounds ({low:g}, {high:g}) must rise and lie between "
+                    f"Kd_floor {self.Kd_floor:g} and Kd_ceiling {self.Kd_ceiling:g}"
                 )
         return self
 
@@ -106,6 +107,9 @@ class ControllerSettings(_Settings):
         _require_lengths(self.law, ("alpha", "lambda_", "Ki", "Kd", "Kd_min", "Kd_max"), joints)
         if self.velocity.estimator == "levant":
             _require_lengths(self.velocity, ("C_rad_s2",), joints)
-        names = ("q_min_rad", "q_max_rad", "dq_max_rad_s", "ddq_max_rad_s2", "dddq_max_rad_s3")
-        names += ("tau_max_Nm", "tau_slew_Nm_s", "following_error_rad", "damping_Nms_rad")
-        _require_lengths(self.limits, names, joints)
+        limits = [
+            name
+            for name, value in LimitSettings.model_fields.items()
+            if value.annotation == Joints
+        ]
+        _require_lengths(self.limits, limits, joints)

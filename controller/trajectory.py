@@ -222,6 +222,8 @@ def approach_duration(
 ) -> float:
     """Return the shortest duration, in whole periods, for which `blend` keeps the limits.
 
+    Position, velocity, acceleration and jerk.
+
     Raises:
         LimitError: If there is none: the states themselves, or the room to turn round.
     """
@@ -230,6 +232,8 @@ def approach_duration(
 
 def brake(start: MotionState, limits: MotionLimits, period_s: float) -> Reference:
     """Return the shortest smooth stop within the limits; where it ends follows from the motion.
+
+    Position, velocity, acceleration and jerk.
 
     Raises:
         LimitError: If the joints cannot stop within the limits.
@@ -250,7 +254,7 @@ def _shortest(
 
     def violation(periods: int) -> Violation | None:
         step_s = max(period_s, periods * period_s / _SCAN_SAMPLES)
-        return make(periods * period_s, step_s).check(limits)
+        return make(periods * period_s, step_s).check(limits, with_jerk=True)
 
     most = max(MIN_PERIODS, floor(limits.max_duration_s / period_s + 1e-6))
     low, high = _bracket(violation, most)
@@ -259,7 +263,7 @@ def _shortest(
         low, high = (low, middle) if violation(middle) is None else (middle, high)
     while True:
         motion = make(high * period_s, period_s)
-        beyond = motion.check(limits)
+        beyond = motion.check(limits, with_jerk=True)
         if beyond is None:
             return motion
         if high >= most:

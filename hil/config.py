@@ -125,7 +125,7 @@ class Config(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Take only what is given: `load_config` lays file, environment and command line together."""
+        """Take only what is given: `load_config` has laid all sources together."""
         del settings_cls, env_settings, dotenv_settings, file_secret_settings
         return (init_settings,)
 
@@ -181,7 +181,12 @@ def preset_defaults(name: str) -> dict[str, Any]:
         "damping_Nms_rad": [1.0] * n,
     }
     axes = [
-        {"family": "cia402", "node_id": j, "rated_torque_Nm": round(tau / 3.0, 3), "torque_max_Nm": tau}
+        {
+            "family": "cia402",
+            "node_id": j,
+            "rated_torque_Nm": round(tau / 3.0, 3),
+            "torque_max_Nm": tau,
+        }
         for j, tau in enumerate(tau_max, start=1)
     ]
     return {
@@ -242,9 +247,7 @@ def parse_assignment(text: str) -> dict[str, Any]:
     return table
 
 
-def load_config(
-    path: str | None = None, overrides: Mapping[str, Any] | None = None
-) -> Config:
+def load_config(path: str | None = None, overrides: Mapping[str, Any] | None = None) -> Config:
     """Read and validate the configuration.
 
     Args:
@@ -285,7 +288,11 @@ def _first_problem(error: ValidationError) -> str:
     first = problems[0]
     where = ".".join(str(part) for part in first["loc"])
     value = first.get("input")
-    shown = "" if isinstance(value, (Mapping, list, tuple)) else f" (got {json.dumps(value, default=str)})"
+    shown = (
+        ""
+        if isinstance(value, (Mapping, list, tuple))
+        else f" (got {json.dumps(value, default=str)})"
+    )
     more = f"; and {len(problems) - 1} more" if len(problems) > 1 else ""
     message = first["msg"].removeprefix("Value error, ")
     return f"{where + ': ' if where else ''}{message}{shown}{more}"

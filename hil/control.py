@@ -33,7 +33,6 @@ class Control:
         machine: State and latched fault.
         player: The reference in force.
         law: The control law; its gains' bounds can be moved.
-        overruns: Skipped periods so far.
         q_rad: Joint angles used in the last cycle.
         dq_rad_s: Joint rates used in the last cycle.
         tau_cmd_Nm: Torques the law requested in the last cycle.
@@ -49,7 +48,6 @@ class Control:
         self.machine = Machine()
         self.player = ReferencePlayer(n, config.loop.period_s)
         self.law = PassivityLaw(settings.law, settings.limits.tau_max_Nm)
-        self.overruns = 0
         self.q_rad = [0.0] * n
         self.dq_rad_s = [0.0] * n
         self.tau_cmd_Nm = [0.0] * n
@@ -80,13 +78,11 @@ class Control:
 
         Args:
             deadline_ns: Feedback that is not there by then is missing in this cycle.
-            periods: Periods since the last cycle, 1 unless some were skipped.
+            periods: Periods of the plant's time since the last cycle, 1 unless some were skipped.
 
         Raises:
             BusError: If the bus is gone. The fault is latched; torque cannot be commanded.
         """
-        if periods > 1:
-            self.overruns += periods - 1
         try:
             self._bus.request_feedback()
             is_fresh = self._bus.collect(deadline_ns)
@@ -270,8 +266,8 @@ class Control:
             axis.enable()
 
     def disable(self) -> None:
-        """Damped stop, then torque off. In IDLE nothing is to be done."""
-        if self.machine.state is State.IDLE:
+        """Damped stop, then torque off; without power, only what `enable` began is ended."""
+        if not self.machine.state.is_powered:
             self._enabling_left = 0
             for axis in self._bus.axes:
                 axis.disable()
@@ -297,7 +293,7 @@ class Control:
             raise CommandError("the arm is being stopped; send the trajectory when it is at rest")
         if player.is_moving != (at_index is not None):
             raise CommandError("the reference has changed since this trajectory was planned")
-        if at_index is not None and at_index != player.index + 1:
+        if at_index is not None and at_index <= player.index:
             raise CommandError("the trajectory came too late to continue the running one")
         player.start(rows, samples)
         self.fire(Trigger.TRAJECTORY)
@@ -320,7 +316,6 @@ class Control:
         for axis in self._bus.axes:
             if axis.status in (AxisStatus.FAULT, AxisStatus.LOST):
                 axis.reset_fault()
-                axis.status = AxisStatus.DISABLED
         self.fire(Trigger.RESET)
 
     def set_gain_bounds(self, Kd_min: Sequence[float], Kd_max: Sequence[float]) -> None:

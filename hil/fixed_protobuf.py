@@ -74,6 +74,11 @@ def _varint(value: int) -> bytes:
     return bytes((*encoded, value))
 
 
+def delimited(message: bytes) -> bytes:
+    """Prefix a serialised message so that it is field 1 of an enclosing message."""
+    return b"\x0a" + _varint(len(message)) + message
+
+
 def fields_of(message: type[Message]) -> list[FieldDescriptor]:
     """Return a message's fields by rising number."""
     fields: Any = message.DESCRIPTOR.fields  # typed differently by every release of the stubs
@@ -109,7 +114,7 @@ class FixedMessages:
         self.fields: Final = tuple(fields)
         self.struct: Final = struct.Struct("<" + "".join(f.struct_format for f in fields))
         self.size: Final = self.struct.size
-        self.prefix: Final = b"\x0a" + _varint(self.size)  # field 1 of the enclosing message
+        self.prefix: Final = delimited(bytes(self.size))[: -self.size]
         self.dtype: Final = self._value_dtype()
         framed = np.ones(self.size, dtype=np.bool_)
         for offset, length in self._value_spans():

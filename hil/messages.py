@@ -113,7 +113,7 @@ class SinusoidRequest(_Motion):
     center_rad: Joints
     amplitude_rad: Joints
     frequency_Hz: Joints
-    phase_rad: Joints | None = Field(None, description="0 if left out")
+    phase_rad: list[Real] = Field([], max_length=MAX_JOINTS, description="0 if left out")
     ramp_s: Duration = 1.0
 
 
@@ -253,9 +253,8 @@ def explain(error: ValidationError) -> str:
     """Say in one line where a message is wrong, what is wrong, and what stood there."""
     first = error.errors(include_url=False, include_context=False)[0]
     text = f"{_place(first['loc'])}{first['msg']}"
-    given = first["input"]
-    if isinstance(given, str | int | float) and first["type"] != "json_invalid":
-        text += f", got {str(given)[:40]!r}"
+    if first["type"] != "json_invalid":
+        text += _got(first["input"])
     more = error.error_count() - 1
     if more:
         text += f" (and {more} more)"
@@ -266,6 +265,14 @@ def schemas() -> dict[str, dict[str, Any]]:
     """Return the JSON Schema of every command's request, and of `reply`."""
     known = {name: adapter.json_schema() for name, adapter in COMMANDS.items()}
     return known | {"reply": Reply.model_json_schema()}
+
+
+def _got(given: object) -> str:
+    if isinstance(given, int) and given.bit_length() > 64:
+        return ", got a number beyond 64 bits"  # Python itself refuses to print the longest
+    if isinstance(given, str):
+        return f", got {given[:40]!r}"
+    return f", got {given}" if isinstance(given, int | float) else ""
 
 
 def _place(loc: tuple[int | str, ...]) -> str:

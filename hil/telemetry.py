@@ -14,7 +14,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from hil.errors import HilError
-from hil.fixed_protobuf import FixedMessages, Records, fields_of, run_field, scalar_field
+from hil.fixed_protobuf import FixedMessages, Records, delimited, fields_of, run_field, scalar_field
 from hil.proto import telemetry_pb2
 
 Buffer = bytearray | memoryview
@@ -153,6 +153,17 @@ class SampleLayout:
         """
         rows = self._messages.split(payload)
         return self._parse_rows(payload) if rows is None else rows
+
+    def decode(self, samples: Sequence[bytes]) -> Records:
+        """Read serialised samples, whoever wrote them; otherwise as `decode_batch`.
+
+        Raises:
+            TelemetryError: If one is not a sample, or has another number of joints.
+        """
+        sizes = set(map(len, samples))
+        if sizes <= {self.size}:
+            return self.decode_batch(self.batch(samples))
+        return self.decode_batch(b"".join(delimited(sample) for sample in samples))
 
     def _parse_rows(self, payload: bytes) -> Records:
         batch = _parse_batch(payload)

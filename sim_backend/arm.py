@@ -9,16 +9,17 @@ rates extrapolated to the middle of the substep.
 
 import math
 from collections.abc import Callable, Sequence
-from math import cos, isfinite, sin, tanh
+from math import cos, hypot, inf, isfinite, sin, tanh
 from typing import Any, cast
 
 import pymunk
 
 from sim_backend.errors import PlantError, SimError
+from sim_backend.linkage import LinkMotion, chain_energy_J, link_motions
 from sim_backend.settings import LinkSettings, PlantSettings
 
 CURRENT_LOOP_PERIOD_NS = 500_000
-SEPARATION_MAX_M = 1e-3  # a sound arm stays below 1e-6 m at working speeds
+DEVIATION_MAX_M = 1e-3  # of the last link; a sound arm stays below 1e-6 m at working speeds
 
 # Calling a property's own function is cheaper than going through the attribute.
 _read_angle = cast("Callable[[pymunk.Body], float]", cast("Any", pymunk.Body.angle).fget)
@@ -61,8 +62,9 @@ class Arm:
         "_friction",
         "_half_s",
         "_joints",
-        "_lever_m",
+        "_levers_m",
         "_rates_before",
+        "_read_out",
         "_space",
         "_substep_ns",
         "_substep_s",
@@ -82,8 +84,11 @@ class Arm:
         _check_friction(settings, self._substep_s)
         self._friction = [(link.viscous_Nms_rad, link.coulomb_Nm) for link in settings.links]
         # Of each link, what it adds to the position of the last link's centre of mass.
-        self._lever_m = [link.length_m for link in settings.links[:-1]] + [settings.links[-1].com_m]
-        self._advance = self._advance_two if len(settings.links) == 2 else self._advance_chain
+        *inner, last = settings.links
+        self._levers_m = [*(link.length_m for link in inner), last.com_m]
+        is_two = len(settings.links) == 2
+        self._advance = self._advance_two if is_two else self._advance_chain
+        self._read_out = self._read_two if is_two else self._read_chain
         self._duration_s = self._substep_s
         self._substeps = 1
         self.reset(settings.q0_rad)
@@ -143,31 +148,23 @@ class Arm:
         self.time_ns += self._substeps * self._substep_ns
         if not self.is_held:
             self._advance(tau_Nm, self._substeps)
-            self._read_out()
+            try:
+                self._read_out()
+            except ValueError as error:  # the cosine of an infinite angle
+                raise PlantError(self._describe_damage(inf)) from error
 
     def energy_J(self) -> float:
         """Kinetic plus potential energy at `time_ns`; the potential is zero at the shoulder."""
-        energy = angle = rate = x = vx = vy = 0.0
-        gravity = self.settings.gravity_m_s2
-        for link, q, dq in zip(self.settings.links, self.q_rad, self.dq_rad_s, strict=True):
-            angle += q
-            rate += dq
-            c, s = cos(angle), sin(angle)
-            com_vx, com_vy = vx - link.com_m * s * rate, vy + link.com_m * c * rate
-            energy += 0.5 * link.mass_kg * (com_vx * com_vx + com_vy * com_vy)
-            energy += 0.5 * link.inertia_kg_m2 * rate * rate
-            energy -= link.mass_kg * gravity * (x + link.com_m * c)
-            x += link.length_m * c
-            vx -= link.length_m * s * rate
-            vy += link.length_m * c * rate
-        return energy
+        return chain_energy_J(self.settings, self.q_rad, self.dq_rad_s)
 
     def joint_separation_m(self) -> float:
         """Largest distance between the two sides of a joint, over all joints."""
-        return max(
-            (j.a.local_to_world(j.anchor_a) - j.b.local_to_world(j.anchor_b)).length
-            for j in self._joints
-        )
+        gaps_m = []
+        for joint in self._joints:
+            inner = joint.a.local_to_world(joint.anchor_a)
+            outer = joint.b.local_to_world(joint.anchor_b)
+            gaps_m.append(hypot(inner.x - outer.x, inner.y - outer.y))
+        return max(gaps_m) if isfinite(sum(gaps_m)) else inf
 
     def _build(self) -> None:
         self._space = space = pymunk.Space()
@@ -177,30 +174,17 @@ class Arm:
         space.iterations = max(10, len(self.settings.links) ** 2)
         self._bodies: list[pymunk.Body] = []
         self._joints: list[pymunk.PivotJoint] = []
-        self._place_bodies()
         before, anchor = space.static_body, (0.0, 0.0)
-        for link, body in zip(self.settings.links, self._bodies, strict=True):
+        for motion in link_motions(self.settings.links, self.q_rad, self.dq_rad_s):
+            body, link = _place_body(motion), motion.link
             joint = pymunk.PivotJoint(before, body, anchor, (-link.com_m, 0.0))
             joint.error_bias = 0.0  # exactly: the whole error is corrected in one substep
             joint.collide_bodies = False
             space.add(body, joint)
+            self._bodies.append(body)
             self._joints.append(joint)
             before, anchor = body, (link.length_m - link.com_m, 0.0)
         self._drift(-self._half_s)
-
-    def _place_bodies(self) -> None:
-        angle = rate = x = y = vx = vy = 0.0
-        for link, q, dq in zip(self.settings.links, self.q_rad, self.dq_rad_s, strict=True):
-            angle += q
-            rate += dq
-            c, s = cos(angle), sin(angle)
-            body = pymunk.Body(link.mass_kg, link.inertia_kg_m2)
-            body.angle, body.angular_velocity = angle, rate
-            body.position = (x + link.com_m * c, y + link.com_m * s)
-            body.velocity = (vx - link.com_m * s * rate, vy + link.com_m * c * rate)
-            self._bodies.append(body)
-            x, y = x + link.length_m * c, y + link.length_m * s
-            vx, vy = vx - link.length_m * s * rate, vy + link.length_m * c * rate
 
     def _drift(self, dt_s: float) -> None:
         for body in self._bodies:
@@ -247,11 +231,11 @@ class Arm:
             dq_2 = _read_rate(body_2) - dq_1
         self.dq_rad_s, self._rates_before = [dq_1, dq_2], [before_1, before_2]
 
-    def _read_out(self) -> None:
+    def _read_chain(self) -> None:
         """Refresh `q_rad` and check that the last link is where the angles put it."""
         half, q = self._half_s, []
         x = y = omega = base = 0.0
-        for body, dq, lever in zip(self._bodies, self.dq_rad_s, self._lever_m, strict=True):
+        for body, dq, lever in zip(self._bodies, self.dq_rad_s, self._levers_m, strict=True):
             omega += dq
             angle = _read_angle(body)
             x += lever * cos(angle)
@@ -260,15 +244,32 @@ class Arm:
             q.append(ahead - base)
             base = ahead
         self.q_rad = q
-        at_x, at_y = _read_position(body)
-        # Written so that NaN fails.
-        if not (abs(x - at_x) < SEPARATION_MAX_M and abs(y - at_y) < SEPARATION_MAX_M):
-            raise PlantError(self._describe_damage())
+        self._check_tip(x, y)
 
-    def _describe_damage(self) -> str:
+    def _read_two(self) -> None:
+        """`_read_chain` unrolled for two links, with the same bits."""
+        half = self._half_s
+        dq_1, dq_2 = self.dq_rad_s
+        lever_1, lever_2 = self._levers_m
+        angle_1, angle_2 = _read_angle(self._bodies[0]), _read_angle(self._bodies[1])
+        ahead_1 = angle_1 + half * dq_1
+        self.q_rad = [ahead_1, angle_2 + half * (dq_1 + dq_2) - ahead_1]
+        self._check_tip(
+            lever_1 * cos(angle_1) + lever_2 * cos(angle_2),
+            lever_1 * sin(angle_1) + lever_2 * sin(angle_2),
+        )
+
+    def _check_tip(self, x_m: float, y_m: float) -> None:
+        at_x_m, at_y_m = _read_position(self._bodies[-1])
+        deviation_m = abs(x_m - at_x_m) + abs(y_m - at_y_m)
+        if not deviation_m < DEVIATION_MAX_M:  # true of NaN, too
+            raise PlantError(self._describe_damage(deviation_m))
+
+    def _describe_damage(self, deviation_m: float) -> str:
         return (
-            f"the arm came apart at t = {self._time_s():.6f} s: joint separation"
-            f" {self.joint_separation_m():.3g} m (limit {SEPARATION_MAX_M:g} m),"
+            f"the arm came apart at t = {self._time_s():.6f} s: its last link is"
+            f" {deviation_m:.3g} m from where the angles put it (limit {DEVIATION_MAX_M:g} m),"
+            f" widest joint gap {self.joint_separation_m():.3g} m,"
             f" q_rad={self.q_rad}, dq_rad_s={self.dq_rad_s};"
             " check torques and inertias, or reduce substep_s"
         )
@@ -284,6 +285,14 @@ class Arm:
 
     def _time_s(self) -> float:
         return self.time_ns * 1e-9
+
+
+def _place_body(motion: LinkMotion) -> pymunk.Body:
+    body = pymunk.Body(motion.link.mass_kg, motion.link.inertia_kg_m2)
+    body.angle, body.angular_velocity = motion.angle_rad, motion.rate_rad_s
+    body.position = (motion.x_m, motion.y_m)
+    body.velocity = (motion.vx_m_s, motion.vy_m_s)
+    return body
 
 
 def _substep_ns(settings: PlantSettings) -> int:

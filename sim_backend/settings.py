@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class _Settings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class LinkSettings(_Settings):
@@ -24,12 +24,17 @@ class PlantSettings(_Settings):
     """The arm: links from the shoulder outwards, q1 from the downward vertical."""
 
     links: tuple[LinkSettings, ...] = Field(min_length=1)
-    gravity_m_s2: float = Field(0.0, ge=0, description="9.81 for a vertical arm, 0 for a horizontal one")
+    gravity_m_s2: float = Field(
+        0.0, ge=0, description="9.81 for a vertical arm, 0 for a horizontal one"
+    )
     tanh_slope_s_rad: float = Field(50.0, gt=0, description="D in tau_f = B dq + C tanh(D dq)")
-    substep_s: float = Field(250e-6, gt=0, description="must divide 500 us, the current loop's period")
+    substep_s: float = Field(
+        250e-6, gt=0, description="must divide 500 us, the current loop's period"
+    )
     q0_rad: tuple[float, ...] = Field(description="pose at power-on, at rest")
     is_held_until_enabled: bool = Field(
-        True, description="the arm stays at its start pose (as on a stand) until a drive is energised"
+        True,
+        description="the arm stays at its start pose (as on a stand) until a drive is energised",
     )
 
 
@@ -50,8 +55,11 @@ class EmulatorSettings(_Settings):
     """How emulated time runs."""
 
     time: Literal["lockstep", "wall"] = Field(
-        "lockstep", description="lockstep: the plant advances one period per SYNC; wall: free-running"
+        "lockstep",
+        description="lockstep: the plant advances one period per SYNC; wall: free-running",
     )
     stall_timeout_s: float = Field(
-        0.5, gt=0, description="lockstep only: without SYNC for this long, time runs by the wall clock"
+        0.5,
+        gt=0,
+        description="lockstep only: without SYNC for this long, time runs by the wall clock",
     )

@@ -187,6 +187,7 @@ class Cia402Axis(Axis):
         self._heartbeat_age = 0
         self.note = ""
         self._reset_cycles = RESET_CYCLES + 1
+        self.status = AxisStatus.DISABLED
         self._statusword = -1  # look at the next one afresh
 
     def end_cycle(self) -> None:
@@ -237,6 +238,9 @@ class Cia402Axis(Axis):
         if state is Cia402State.OPERATION_ENABLED:
             self.status = AxisStatus.ENABLED
         elif state in (Cia402State.FAULT, Cia402State.FAULT_REACTION_ACTIVE):
+            if self._reset_cycles:  # the reset is on its way: judge the next statusword
+                self._statusword = -1
+                return
             self.status = AxisStatus.FAULT
             self.note = self.note or f"{self.label}: drive fault (statusword {statusword:04X})"
         else:

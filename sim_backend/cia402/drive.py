@@ -9,10 +9,16 @@ from drivers.cia402.codec import (
     STATUS_REMOTE,
     STATUS_VOLTAGE_ENABLED,
     Cia402State,
+    Index,
 )
-from sim_backend.cia402.drive_state import DriveStateMachine
+from drivers.cia402.sdo import SdoAbort
+from sim_backend.cia402.dictionary import ObjectDictionary
+from sim_backend.cia402.drive_state import QUICK_STOP_OPTIONS, DriveStateMachine
 from sim_backend.cia402.emergency import Emergency
 from sim_backend.servo import Servo
+
+MODES = (0, CST)
+"""What 6060 accepts: no mode, and cyclic synchronous torque."""
 
 _I16_MIN, _I16_MAX = -0x8000, 0x7FFF
 _U16_MAX = 0xFFFF
@@ -99,11 +105,6 @@ class Drive:
         if self._is_following:
             self._apply_torque()
 
-    def set_mode(self, mode: int) -> None:
-        """Take a mode of operation (6060): 0 or 10."""
-        self.mode = mode
-        self._follow_state()
-
     def fail(self, code: int) -> None:
         """Enter fault: power off at once, then the emergency message."""
         self.machine.fail()
@@ -151,6 +152,40 @@ class Drive:
     def current(self) -> int:
         """6078, per mille of `rated_current_mA`."""
         return _to_i16(self._servo.current_A / self._A_per_mille)
+
+    # --- object dictionary ------------------------------------------------------------------
+
+    def bind(self, dictionary: ObjectDictionary) -> None:
+        """Put the drive behind its objects."""
+        machine, bind = self.machine, dictionary.bind
+        bind(Index.CONTROLWORD, read=lambda: machine.controlword, write=self.control)
+        bind(Index.STATUSWORD, read=self.statusword)
+        bind(Index.MODE, read=lambda: self.mode, write=self._write_mode)
+        bind(Index.MODE_DISPLAY, read=lambda: self.mode)
+        bind(Index.TARGET_TORQUE, read=lambda: self.target_torque, write=self.set_target_torque)
+        bind(Index.MAX_TORQUE, read=lambda: self.max_torque, write=self.set_max_torque)
+        bind(
+            Index.QUICK_STOP_OPTION,
+            read=lambda: machine.quick_stop_option,
+            write=self._write_quick_stop_option,
+        )
+        bind(Index.POSITION_ACTUAL, read=self.position)
+        bind(Index.VELOCITY_ACTUAL, read=self.velocity)
+        bind(Index.TORQUE_ACTUAL, read=self.torque)
+        bind(Index.CURRENT_ACTUAL, read=self.current)
+
+    def _write_mode(self, mode: int) -> SdoAbort | None:
+        if mode not in MODES:
+            return SdoAbort.VALUE_RANGE
+        self.mode = mode
+        self._follow_state()
+        return None
+
+    def _write_quick_stop_option(self, option: int) -> SdoAbort | None:
+        if option not in QUICK_STOP_OPTIONS:
+            return SdoAbort.VALUE_RANGE
+        self.machine.quick_stop_option = option
+        return None
 
     # --- servo ------------------------------------------------------------------------------
 

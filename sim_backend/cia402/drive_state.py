@@ -9,6 +9,8 @@ from drivers.cia402.codec import Cia402State
 
 _S = Cia402State
 FAULT_RESET_BIT = 0x80
+QUICK_STOP_OPTIONS = (0, 1, 2, 5, 6)
+"""605A: 3, 4, 7 and 8 (stops at the current or voltage limit) are not offered."""
 STAYS_IN_QUICK_STOP = 5
 """Quick stop options (605A) from here on stay in QUICK STOP ACTIVE; lower ones leave it."""
 
@@ -70,10 +72,8 @@ class DriveStateMachine:
     __slots__ = ("_is_resume_blocked", "controlword", "quick_stop_option", "state")
 
     def __init__(self) -> None:
+        self.initialise()
         self.state = _S.NOT_READY_TO_SWITCH_ON
-        self.controlword = 0
-        self.quick_stop_option = 2
-        self._is_resume_blocked = False
 
     @property
     def is_powered(self) -> bool:
@@ -88,6 +88,7 @@ class DriveStateMachine:
     def initialise(self) -> None:
         """Transitions 0 and 1: self-test passed, ready for the first command."""
         self.controlword = 0
+        self.quick_stop_option = 2
         self._is_resume_blocked = False
         self.state = _S.SWITCH_ON_DISABLED
 

@@ -28,7 +28,6 @@ class _Transfer:
     index: int
     subindex: int
     data: bytearray = field(default_factory=bytearray)
-    size: int | None = None
     toggle: int = 0
 
 
@@ -71,7 +70,7 @@ class SdoServer:
         elif frame.is_expedited:
             self._store(index, subindex, frame.data[: self._dictionary.size_of(index, subindex)])
         else:
-            self._transfer = _Transfer(frame.kind, index, subindex, size=frame.size)
+            self._transfer = _Transfer(frame.kind, index, subindex)
             self._send(sdo_download_response(index, subindex))
 
     def _start_upload(self, frame: SdoFrame) -> None:

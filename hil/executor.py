@@ -1,0 +1,92 @@
+"""Carries out commands inside the loop, at most a few a cycle, and says what became of them.
+
+Commands come from the gateway already checked against the configuration; what is left to check
+here is the state at the very cycle in which they take effect.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from controller.errors import CommandError
+from hil.control import Control
+
+Rows = Callable[[int], Sequence[float]]
+"""Returns the flat doubles of a trajectory slot."""
+Outcome = Callable[[Mapping[str, Any], str], None]
+"""Told the command and the reason of its refusal, empty if it was carried out."""
+
+
+class Executor:
+    """Carries out commands on one `Control`.
+
+    A trajectory that continues a running one waits here until the row at which they meet.
+
+    Attributes:
+        active_slot: Slot of the trajectory that was started last, -1 before the first.
+    """
+
+    def __init__(self, control: Control, rows: Rows, outcome: Outcome) -> None:
+        self._control = control
+        self._rows = rows
+        self._outcome = outcome
+        self._pending: Mapping[str, Any] | None = None
+        self.active_slot = -1
+        self._verbs: dict[str, Callable[[Mapping[str, Any]], None]] = {
+            "enable": lambda _: control.enable(),
+            "disable": self._disable,
+            "stop": self._stop,
+            "estop": self._estop,
+            "reset": lambda _: control.reset(),
+            "gain_bounds": lambda c: control.set_gain_bounds(c["Kd_min"], c["Kd_max"]),
+            "fault": lambda c: control.inject_fault(c["joint"]),
+        }
+
+    def execute(self, command: Mapping[str, Any]) -> None:
+        """Carry out one command now, or keep a trajectory for the row it is meant for."""
+        if command["verb"] == "trajectory":
+            self._drop_pending("replaced by a later trajectory")
+            self._pending = command
+            return
+        self._attempt(self._verbs[command["verb"]], command)
+
+    def begin_cycle(self, periods: int) -> None:
+        """Start the waiting trajectory if this is its cycle; call once a cycle, before the law."""
+        command = self._pending
+        if command is None:
+            return
+        at_index, player = command["at_index"], self._control.player
+        if at_index is None or not player.is_moving or player.index + periods >= at_index:
+            self._pending = None
+            self._attempt(self._start, command)
+
+    def _start(self, command: Mapping[str, Any]) -> None:
+        rows = self._rows(command["slot"])
+        self._control.start(rows, command["samples"], at_index=command["at_index"])
+        self.active_slot = command["slot"]
+
+    def _disable(self, _: Mapping[str, Any]) -> None:
+        self._drop_pending("the arm was disabled")
+        self._control.disable()
+
+    def _stop(self, _: Mapping[str, Any]) -> None:
+        self._drop_pending("the arm was stopped")
+        self._control.stop()
+
+    def _estop(self, _: Mapping[str, Any]) -> None:
+        self._drop_pending("emergency stop")
+        self._control.estop()
+
+    def _drop_pending(self, reason: str) -> None:
+        command, self._pending = self._pending, None
+        if command is not None:
+            self._outcome(command, reason)
+
+    def _attempt(
+        self, action: Callable[[Mapping[str, Any]], None], command: Mapping[str, Any]
+    ) -> None:
+        try:
+            action(command)
+        except CommandError as error:
+            self._outcome(command, str(error))
+        else:
+            self._outcome(command, "")

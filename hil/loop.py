@@ -1,0 +1,244 @@
+"""The real-time process: owns the bus, runs the cycle at absolute deadlines, and nothing else."""
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Mapping
+from time import thread_time_ns
+from typing import Any
+
+from controller.faults import FaultCode
+from controller.machine import State, Trigger
+from drivers.arm_bus import ArmBus
+from drivers.axis import AxisInfo
+from drivers.bus import open_bus
+from drivers.errors import BusError, DriverError
+from drivers.registry import make_axes
+from hil.config import Config
+from hil.control import Control
+from hil.errors import HilError
+from hil.executor import Executor
+from hil.realtime import (
+    Granted,
+    Sleeper,
+    die_with_parent,
+    freeze_garbage,
+    make_realtime,
+    now_ns,
+    usage,
+)
+from hil.sampler import Sampler, Stamps
+from hil.shared import SharedMemory
+
+STATUS_EVERY_S = 0.1
+GATEWAY_TIMEOUT_NS = 1_000_000_000
+FAREWELL_CYCLES = 5
+"""Cycles run after power went off, so that every amplifier has the last word."""
+
+
+class Loop:
+    """The control loop on its shared memory."""
+
+    def __init__(self, shared: SharedMemory, bus: ArmBus, infos: list[AxisInfo]) -> None:
+        config = shared.config
+        self._shared = shared
+        self._config = config
+        self._bus = bus
+        self._infos = infos
+        self._period_ns = round(config.loop.period_s * 1e9)
+        self._timeout_ns = round(config.loop.feedback_timeout_s * 1e9)
+        self._is_lockstep = infos[0].is_lockstep
+        self._control = Control(config, bus, now_ns=now_ns, events=self._emit)
+        self._executor = Executor(self._control, shared.rows, self._report_outcome)
+        self._sampler = Sampler(shared.layout, self._control, bus)
+        self._commands = shared.reader("commands", "loop")
+        self._parent = os.getppid()
+        self._cycle = 0
+        self._overruns = 0
+        self._estops_seen = shared.estop_requests
+        self._has_gateway = False
+        self._is_ending = False
+        self._granted = Granted("SCHED_OTHER", memory_locked=False, missing=())
+        self._write_frame = shared.frame_layout.writer()
+        self._frame_size = shared.frame_layout.size
+
+    def run(self, granted: Granted) -> None:
+        """Run cycles until a signal ends the loop and torque is off.
+
+        Raises:
+            BusError: If the bus is gone. The amplifiers' own watchdogs remove torque.
+        """
+        self._granted = granted
+        self._bus.log_frames(self._log_frame)
+        self._control.fire(Trigger.BUS_READY)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._end)
+        sleeper = Sleeper()
+        status_every = round(STATUS_EVERY_S / self._config.loop.period_s)
+        farewell = FAREWELL_CYCLES
+        start_ns = now_ns() + self._period_ns
+        while farewell:
+            sleeper.until(start_ns)
+            woke_ns = now_ns()
+            skipped = max(0, (woke_ns - start_ns) // self._period_ns)
+            start_ns += skipped * self._period_ns  # skipped, never made up by a burst
+            self._overruns += skipped
+            self._cycle += skipped
+            self._run_cycle(start_ns, woke_ns, 1 if self._is_lockstep else 1 + skipped)
+            if self._cycle % status_every == 0:
+                self._look_after()
+            self._cycle += 1
+            start_ns += self._period_ns
+            if self._is_ending and not self._control.machine.state.is_powered:
+                farewell -= 1
+        self._look_after()
+
+    def _run_cycle(self, start_ns: int, woke_ns: int, periods: int) -> None:
+        cpu_ns = thread_time_ns()
+        if self._shared.estop_requests != self._estops_seen:
+            self._estops_seen = self._shared.estop_requests
+            self._control.estop()
+        if self._is_ending:
+            self._control.disable()
+        for record in self._commands.read(1):
+            self._executor.execute(json.loads(record))
+        self._executor.begin_cycle(periods)
+        self._control.step(start_ns + self._timeout_ns, periods)
+        sent_ns = now_ns()
+        stamps = Stamps(
+            woke_ns - start_ns,
+            self._control.feedback_ns - start_ns,
+            self._control.law_ns - start_ns,
+            sent_ns - start_ns,
+            thread_time_ns() - cpu_ns,
+        )
+        ring = self._shared.samples
+        offset = ring.begin(self._shared.layout.size)
+        self._sampler.write(ring.memory, offset, (self._cycle, start_ns, self._overruns), stamps)
+        ring.commit()
+        self._shared.beat("loop", sent_ns)
+
+    # --- every 100 ms ------------------------------------------------------------------------
+
+    def _look_after(self) -> None:
+        self._watch_supervisor()
+        self._watch_gateway()
+        bus, machine = self._bus, self._control.machine
+        self._shared.post_status(
+            {
+                "state": machine.state.name,
+                "fault": machine.fault.name,
+                "cycle": self._cycle,
+                "samples": self._sampler.seq,
+                "overruns": self._overruns,
+                "active_slot": self._executor.active_slot,
+                "frames_sent": bus.stats.frames_sent,
+                "frames_received": bus.stats.frames_received,
+                "send_failures": bus.stats.send_failures,
+                "late_frames": bus.late_frames,
+                "unknown_frames": bus.unknown_frames,
+                "error_frames": bus.error_frames,
+                "scheduler": self._granted.scheduler,
+                "memory_locked": self._granted.memory_locked,
+                "realtime_missing": list(self._granted.missing),
+                "is_lockstep": self._is_lockstep,
+                "amplifiers": [info.name for info in self._infos],
+                **usage(),
+            }
+        )
+
+    def _watch_supervisor(self) -> None:
+        if os.getppid() != self._parent and not self._is_ending:
+            self._control.trip(FaultCode.SUPERVISOR_LOST)
+            self._is_ending = True
+
+    def _watch_gateway(self) -> None:
+        beat_ns = self._shared.last_beat("gateway")
+        is_there = beat_ns > 0 and now_ns() - beat_ns < GATEWAY_TIMEOUT_NS
+        if self._has_gateway and not is_there:
+            self._control.trip(FaultCode.GATEWAY_LOST)
+            policy = self._config.loop.on_gateway_loss
+            state = self._control.machine.state
+            if policy == "hold" and state is State.ACTIVE:
+                self._control.stop()
+            elif policy == "stop" and state.is_powered:
+                self._control.disable()
+        self._has_gateway = is_there
+
+    # --- reporting ---------------------------------------------------------------------------
+
+    def _emit(self, kind: str, detail: Mapping[str, Any]) -> None:
+        event = {"t_ns": now_ns(), "cycle": self._cycle, "kind": kind, **detail}
+        self._shared.events.append(json.dumps(event).encode())
+
+    def _report_outcome(self, command: Mapping[str, Any], reason: str) -> None:
+        self._emit(
+            "command",
+            {"id": command["id"], "verb": command["verb"], "ok": not reason, "reason": reason},
+        )
+
+    def _log_frame(self, direction: int, frame: bytes) -> None:
+        ring = self._shared.frames
+        self._write_frame(ring.memory, ring.begin(self._frame_size), now_ns(), direction, frame)
+        ring.commit()
+
+    def _end(self, *_: object) -> None:
+        """Signal handler: from the next cycle on, come to a damped stop, then end."""
+        self._is_ending = True
+
+
+def open_arm(config: Config) -> tuple[ArmBus, list[AxisInfo]]:
+    """Join the bus and set up every amplifier, disabled.
+
+    Raises:
+        DriverError: If the bus or an amplifier is not there or not as configured.
+    """
+    period_s = config.loop.period_s
+    bus = ArmBus(
+        open_bus(config.bus.address), make_axes(config.axes, period_s=period_s), now_ns=now_ns
+    )
+    heartbeat_s = min(axis.heartbeat_ms for axis in config.axes) * 1e-3
+    try:
+        return bus, bus.configure(heartbeat_cycles=max(1, round(heartbeat_s / period_s)))
+    except BaseException:
+        bus.close()
+        raise
+
+
+def main(shared_fd: int, parent_pid: int) -> int:
+    """Entry of the loop process.
+
+    Returns:
+        0 after an orderly end, 1 with one line on stderr otherwise.
+    """
+    die_with_parent(parent_pid)
+    shared = SharedMemory(shared_fd)
+    try:
+        bus, infos = open_arm(shared.config)
+    except DriverError as error:
+        print(f"hil: {error}", file=sys.stderr)  # noqa: T201 - the line the user is promised
+        return 1
+    try:
+        granted = make_realtime(shared.config.loop)
+        freeze_garbage()
+        Loop(shared, bus, infos).run(granted)
+    except (HilError, BusError) as error:
+        print(f"hil: {error}", file=sys.stderr)  # noqa: T201 - the line the user is promised
+        return 1
+    finally:
+        _last_word(bus)
+    return 0
+
+
+def _last_word(bus: ArmBus) -> None:
+    """Whatever ended the loop: tell every amplifier to take torque off, then leave the bus."""
+    try:
+        for axis in bus.axes:
+            axis.disable()
+        bus.request_feedback()
+        bus.send_torques([0.0] * len(bus.axes))
+        bus.request_feedback()
+    except BusError:
+        pass  # the amplifiers' watchdogs act
+    bus.close()

@@ -1,0 +1,170 @@
+"""The emulated robot: one arm, a servo and an amplifier node per joint, and emulated time.
+
+Every 500 us each current loop runs and the arm advances under its mean torques; every second
+time the nodes' timers tick. In lockstep a SYNC, once all nodes have latched and answered it,
+advances everything by one period; otherwise the caller passes the wall's time on.
+"""
+
+from collections.abc import Sequence
+
+from drivers.frame import ERR_FLAG, FRAME_SIZE, RTR_FLAG, unpack_frame
+from sim_backend.arm import CURRENT_LOOP_PERIOD_NS, Arm
+from sim_backend.errors import SimError
+from sim_backend.node import AmplifierNode
+from sim_backend.servo import CURRENT_LOOP_PERIOD_S, Servo
+
+SYNC_ID = 0x080
+TICK_S = 1e-3
+_NOT_DATA = RTR_FLAG | ERR_FLAG
+
+
+class Emulator:
+    """Everything behind the wire.
+
+    If the plant's settings say so, the arm is held at its start pose until the first servo is
+    energised, and never again after that.
+
+    Args:
+        arm: The plant.
+        servos: One per joint, shoulder first.
+        nodes: The amplifiers that command these servos, in any order.
+        is_lockstep: SYNC advances time. May be changed at any instant.
+
+    Attributes:
+        is_lockstep: See above.
+        q_true_rad: The plant's joint angles at the last SYNC, when the encoders were latched.
+        dq_true_rad_s: The plant's joint rates at the last SYNC.
+        tau_applied_Nm: Mean motor torque per joint over the last whole period of 1 ms.
+
+    Raises:
+        SimError: If the number of servos or nodes is not the number of joints.
+    """
+
+    __slots__ = (
+        "_arm",
+        "_first_half_Nm",
+        "_is_waiting",
+        "_nodes",
+        "_remainder_ns",
+        "_servos",
+        "dq_true_rad_s",
+        "is_lockstep",
+        "q_true_rad",
+        "tau_applied_Nm",
+    )
+
+    def __init__(
+        self,
+        arm: Arm,
+        servos: Sequence[Servo],
+        nodes: Sequence[AmplifierNode],
+        *,
+        is_lockstep: bool,
+    ) -> None:
+        count = len(arm.q_rad)
+        if len(servos) != count or len(nodes) != count:
+            raise SimError(
+                f"an arm of {count} joints needs {count} servos and nodes:"
+                f" got {len(servos)} and {len(nodes)}"
+            )
+        self._arm, self._servos, self._nodes = arm, tuple(servos), tuple(nodes)
+        self.is_lockstep = is_lockstep
+        self._is_waiting = arm.settings.is_held_until_enabled
+        if self._is_waiting:
+            arm.hold()
+        self._remainder_ns = 0
+        self._first_half_Nm: list[float] | None = None
+        self.tau_applied_Nm = [0.0] * count
+        self._sense()
+        self._latch_truth()
+
+    @property
+    def time_ns(self) -> int:
+        """Emulated time since the arm's reset."""
+        return self._arm.time_ns
+
+    def power_on(self) -> None:
+        """Switch every amplifier on; each announces itself."""
+        for node in self._nodes:
+            node.power_on()
+
+    def receive(self, frame: bytes) -> None:
+        """Take one frame from the wire.
+
+        Anything that is not a data frame is ignored. In lockstep a SYNC advances one period
+        after the nodes have answered it.
+
+        Args:
+            frame: 16-byte record (`drivers.frame`).
+
+        Raises:
+            PlantError: If the arm broke down while advancing.
+        """
+        if len(frame) != FRAME_SIZE:
+            return
+        can_id, data = unpack_frame(frame)
+        if can_id & _NOT_DATA:
+            return
+        if can_id != SYNC_ID:
+            for node in self._nodes:
+                node.receive(can_id, data)
+            return
+        self._latch_truth()
+        for node in self._nodes:
+            node.receive(can_id, data)
+        if self.is_lockstep:
+            self.advance_period()
+
+    def advance_period(self) -> None:
+        """Advance by 1 ms: two current-loop periods.
+
+        Raises:
+            PlantError: If the arm broke down.
+        """
+        self._run_current_loop()
+        self._run_current_loop()
+
+    def advance(self, duration_ns: int) -> None:
+        """Advance by elapsed time; what does not fill a current-loop period is kept for later.
+
+        Args:
+            duration_ns: At least 0.
+
+        Raises:
+            SimError: If `duration_ns` is negative. Nothing has moved.
+            PlantError: If the arm broke down.
+        """
+        if duration_ns < 0:
+            raise SimError(f"emulated time cannot run backwards: advance({duration_ns} ns)")
+        periods, self._remainder_ns = divmod(
+            self._remainder_ns + duration_ns, CURRENT_LOOP_PERIOD_NS
+        )
+        for _ in range(periods):
+            self._run_current_loop()
+
+    def _run_current_loop(self) -> None:
+        """Advance by 500 us, and tick the nodes if that completes a period."""
+        servos, arm = self._servos, self._arm
+        tau_Nm = [servo.drive() for servo in servos]
+        if self._is_waiting and any(servo.is_energised for servo in servos):
+            self._is_waiting = False
+            arm.release()
+        arm.step(tau_Nm, CURRENT_LOOP_PERIOD_S)
+        self._sense()
+        first = self._first_half_Nm
+        if first is None:
+            self._first_half_Nm = tau_Nm
+            return
+        self._first_half_Nm = None
+        self.tau_applied_Nm = [0.5 * (a + b) for a, b in zip(first, tau_Nm, strict=True)]
+        for node in self._nodes:
+            node.tick(TICK_S)
+
+    def _sense(self) -> None:
+        arm = self._arm
+        for servo, q_rad, dq_rad_s in zip(self._servos, arm.q_rad, arm.dq_rad_s, strict=True):
+            servo.sense(q_rad, dq_rad_s)
+
+    def _latch_truth(self) -> None:
+        # The arm makes new lists at every step, so these stay what they are.
+        self.q_true_rad, self.dq_true_rad_s = self._arm.q_rad, self._arm.dq_rad_s

@@ -1,0 +1,304 @@
+"""What only one bus back-end has: its own failures, limits and remedies."""
+
+import errno
+import select
+import socket
+import subprocess
+import threading
+from contextlib import closing
+from itertools import count
+from pathlib import Path
+
+import can
+import pytest
+
+from drivers.bus import open_bus, split_address
+from drivers.buses.loopback import LoopbackBus
+from drivers.buses.python_can import PythonCanBus
+from drivers.buses.socketcan import SocketCanBus
+from drivers.buses.unix import UnixBus
+from drivers.errors import BusAddressError, BusError
+from drivers.frame import EFF_FLAG, RTR_FLAG, pack_frame, unpack_frame
+
+WAIT_S = 5.0
+_numbers = count(1)
+
+
+@pytest.fixture
+def channel():
+    return f"backends-{next(_numbers)}"
+
+
+@pytest.fixture
+def peer_and_bus(socket_path):
+    """A bare listening socket in the hub's place, and a bus connected to it."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(socket_path)
+        listener.listen()
+        with UnixBus(socket_path) as bus:
+            peer, _ = listener.accept()
+            with peer:
+                yield peer, bus
+
+
+# --- addresses
+
+
+@pytest.mark.parametrize(
+    ("address", "expected"),
+    [
+        ("unix:/run/hil/bus", ("unix", "/run/hil/bus")),
+        ("vcan0", ("socketcan", "vcan0")),
+        ("socketcan:can1", ("socketcan", "can1")),
+        ("python-can:pcan:PCAN_USBBUS1@1000000", ("python-can", "pcan:PCAN_USBBUS1@1000000")),
+    ],
+)
+def test_split_address__each_form__is_understood(address, expected):
+    assert split_address(address) == expected
+
+
+@pytest.mark.parametrize("address", ["", "unix:", "canopen:can0", "python-can:virtual"])
+def test_open_bus__unusable_address__names_the_forms(address):
+    with pytest.raises(BusAddressError, match=r"python-can:INTERFACE:CHANNEL"):
+        open_bus(address)
+
+
+# --- unix
+
+
+def test_unix__no_socket_file__says_what_to_start(socket_path):
+    with pytest.raises(BusError, match=f"no bus at unix:{socket_path}: .*start `hil emulate`"):
+        UnixBus(socket_path)
+
+
+def test_unix__nobody_listens__says_what_to_start(socket_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as dead:
+        dead.bind(socket_path)
+    with pytest.raises(BusError, match="refused; start `hil emulate` first"):
+        UnixBus(socket_path)
+
+
+def test_unix__path_too_long__is_a_bus_error():
+    with pytest.raises(BusError, match="no bus at unix:"):
+        UnixBus("/tmp/" + "x" * 200)
+
+
+def test_unix__records_of_wrong_size__are_dropped_and_counted(peer_and_bus):
+    peer, bus = peer_and_bus
+    frame = pack_frame(0x181, b"\x01")
+    for record in (b"", b"x", frame[:15], frame + b"x", bytes(72), frame):
+        peer.send(record)
+    assert bus.recv(WAIT_S) == frame
+    assert bus.stats.malformed_records == 5
+    assert bus.stats.frames_received == 1
+
+
+def test_unix__only_wrong_records__time_out_still_holds(peer_and_bus):
+    peer, bus = peer_and_bus
+    peer.send(b"x")
+    assert bus.recv(0.01) is None
+    assert bus.stats.malformed_records == 1
+
+
+def test_unix__queue_full__frame_is_lost_and_counted(peer_and_bus):
+    peer, bus = peer_and_bus
+    sent = 0
+    while bus.send(pack_frame(sent & 0x7FF, sent.to_bytes(8, "little"))):
+        sent += 1
+    assert bus.send(pack_frame(1)) is False
+    assert (bus.stats.frames_sent, bus.stats.send_failures) == (sent, 2)
+    for expected in range(sent):
+        assert unpack_frame(peer.recv(16))[1] == expected.to_bytes(8, "little")
+    assert bus.send(pack_frame(1)) is True
+
+
+def test_unix__peer_closed__queued_frames_come_before_the_error(peer_and_bus):
+    peer, bus = peer_and_bus
+    peer.send(pack_frame(1))
+    peer.close()
+    assert bus.recv(WAIT_S) == pack_frame(1)
+    with pytest.raises(BusError, match="gone: the emulator has closed it"):
+        bus.recv(0.0)
+
+
+def test_unix__closed_while_a_thread_waits__thread_is_woken(peer_and_bus):
+    _, bus = peer_and_bus
+    errors: list[BusError] = []
+    is_waiting = threading.Event()
+
+    def wait() -> None:
+        is_waiting.set()
+        try:
+            bus.recv(60.0)
+        except BusError as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    is_waiting.wait()
+    bus.close()
+    thread.join(WAIT_S)
+    assert not thread.is_alive()
+    assert len(errors) == 1
+
+
+# --- loopback
+
+
+def test_loopback__nothing_queued__virtual_time_advances_once():
+    bus = LoopbackBus()
+    waits: list[float] = []
+
+    def advance(timeout_s: float) -> None:
+        waits.append(timeout_s)
+        if len(waits) == 2:
+            bus.deliver(pack_frame(7))
+
+    bus.connect(bus.deliver, advance)
+    assert bus.recv(0.001) is None
+    assert bus.recv(0.002) == pack_frame(7)
+    assert waits == [0.001, 0.002]
+
+
+def test_loopback__answer_within_send__waits_in_order():
+    bus = LoopbackBus()
+    bus.connect(lambda frame: [bus.deliver(frame), bus.deliver(pack_frame(2))] and None)
+    bus.send(pack_frame(1))
+    assert [bus.recv(0.0), bus.recv(0.0), bus.recv(0.0)] == [pack_frame(1), pack_frame(2), None]
+
+
+def test_loopback__nobody_connected__frames_vanish():
+    bus = LoopbackBus()
+    assert bus.send(pack_frame(1)) is True
+    assert bus.recv(1.0) is None
+
+
+# --- python-can
+
+
+@pytest.mark.parametrize("address", ["virtual", "virtual:", ":channel"])
+def test_python_can__half_an_address__names_the_form(address):
+    with pytest.raises(BusAddressError, match="python-can:INTERFACE:CHANNEL"):
+        PythonCanBus(address)
+
+
+def test_python_can__unknown_interface__is_a_bus_error():
+    with pytest.raises(BusError, match="no bus python-can:nosuch:0: .*nosuch"):
+        PythonCanBus("nosuch:0")
+
+
+def test_python_can__adapter_missing__is_a_bus_error():
+    with pytest.raises(BusError, match="no bus python-can:slcan:/dev/nosuch"):
+        PythonCanBus("slcan:/dev/nosuch@1000000")
+
+
+def test_python_can__bit_rate_in_the_address__reaches_the_interface(channel):
+    with PythonCanBus(f"virtual:{channel}@1000000") as bus, PythonCanBus(f"virtual:{channel}") as b:
+        bus.send(pack_frame(1))
+        assert b.recv(WAIT_S) == pack_frame(1)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        can.Message(arbitration_id=1, is_extended_id=False, is_fd=True, data=bytes(8)),
+        can.Message(arbitration_id=1, is_extended_id=False, data=bytes(12)),
+        can.Message(arbitration_id=0x800, is_extended_id=False),
+        can.Message(arbitration_id=-1),
+        can.Message(arbitration_id=1, dlc=9),
+    ],
+)
+def test_python_can__no_classic_frame_received__is_dropped_and_counted(channel, message):
+    with PythonCanBus(f"virtual:{channel}") as bus, can.Bus(channel, "virtual") as raw:
+        raw.send(message)
+        raw.send(can.Message(arbitration_id=5, is_extended_id=False))
+        assert bus.recv(WAIT_S) == pack_frame(5)
+        assert (bus.stats.malformed_records, bus.stats.frames_received) == (1, 1)
+
+
+def test_python_can__adapter_fails_in_use__is_a_bus_error(channel):
+    with PythonCanBus(f"virtual:{channel}") as bus:
+        bus._bus.shutdown()  # as an unplugged adapter does: every call fails from now on
+        with pytest.raises(BusError, match="gone: Cannot operate on a closed bus"):
+            bus.send(pack_frame(1))
+        with pytest.raises(BusError, match="gone: Cannot operate on a closed bus"):
+            bus.recv(0.0)
+
+
+# --- socketcan
+
+
+def test_socketcan__kernel_without_can__names_the_alternatives():
+    try:
+        socket.socket(29, socket.SOCK_RAW, 1).close()
+    except OSError:
+        with pytest.raises(BusError, match=r"kernel has no CAN \(AF_CAN\); use unix:PATH"):
+            SocketCanBus("vcan0")
+    else:
+        pytest.skip("this kernel has CAN")
+
+
+def test_socketcan__no_such_interface__says_how_to_make_one(vcan):
+    with pytest.raises(BusError, match="no CAN interface nosuch0; .*ip link add dev vcan0"):
+        SocketCanBus("nosuch0")
+
+
+def test_socketcan__not_a_can_interface__is_refused(vcan):
+    with pytest.raises(BusError, match="no CAN interface lo"):
+        SocketCanBus("lo")
+
+
+def test_socketcan__interface_down__says_how_to_raise_it(own_vcan):
+    if own_vcan is None:
+        pytest.skip("not allowed to make a vcan interface")
+    subprocess.run(["ip", "link", "set", own_vcan, "down"], check=True)
+    with pytest.raises(BusError, match=f"is down; `ip link set {own_vcan} up`"):
+        SocketCanBus(own_vcan)
+
+
+def test_socketcan__interface_removed_in_use__is_a_bus_error(own_vcan):
+    if own_vcan is None:
+        pytest.skip("not allowed to make a vcan interface")
+    with SocketCanBus(own_vcan) as bus:
+        subprocess.run(["ip", "link", "delete", own_vcan], check=True)
+        for use in (lambda: bus.recv(WAIT_S), lambda: bus.send(pack_frame(1))):
+            with pytest.raises(BusError, match=f"socketcan:{own_vcan}"):
+                use()
+
+
+def test_socketcan__filters__pass_exactly_the_named_identifiers(vcan):
+    wide = pack_frame(0x181 | EFF_FLAG)
+    frames = [pack_frame(0x181), pack_frame(0x182), pack_frame(0x181 | RTR_FLAG), wide]
+    with SocketCanBus(vcan) as sender, SocketCanBus(vcan) as bus:
+        bus.set_filters([0x181])
+        for frame in frames:
+            sender.send(frame)
+        bus.set_filters([0x181 | EFF_FLAG, 0x181 | RTR_FLAG])
+        for frame in frames:
+            sender.send(frame)
+        bus.set_filters(None)
+        sender.send(pack_frame(0x7FF))
+        received = [bus.recv(WAIT_S) for _ in range(4)]
+        assert received == [frames[0], frames[2], wide, pack_frame(0x7FF)]
+        with pytest.raises(BusError, match="513 kernel filters asked for, at most 512"):
+            bus.set_filters(range(513))
+
+
+def test_socketcan__reader_too_slow__lost_frames_are_counted(vcan):
+    with SocketCanBus(vcan) as sender, SocketCanBus(vcan) as bus:
+        bus._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 200 * 1024)
+        for i in range(5000):
+            assert sender.send(pack_frame(i & 0x7FF))
+        while bus.recv(0.0) is not None:
+            pass
+        assert bus.stats.receive_overflows > 0
+        assert bus.stats.frames_received + bus.stats.receive_overflows == 5000
+
+
+def test_socketcan__transmit_queue_full__frame_is_lost_and_counted(slcan_interface):
+    with SocketCanBus(slcan_interface) as bus:
+        sent = 0
+        while bus.send(pack_frame(1, bytes(8))):
+            sent += 1
+            assert sent < 100_000
+        assert (bus.stats.frames_sent, bus.stats.send_failures) == (sent, 1)
