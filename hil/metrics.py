@@ -7,11 +7,12 @@ along the trajectory: rows in which none runs do not count.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.decay import decay_rates, has_truth
 from hil.errors import HilError
 from hil.fixed_protobuf import Records
 from hil.scenarios import COUNT_RAD, Scenario
@@ -19,7 +20,7 @@ from hil.scenarios import COUNT_RAD, Scenario
 Array = NDArray[np.float64]
 PerJoint = tuple[float, ...]
 
-UNITS: Final = {
+UNITS: Final[dict[str, str]] = {
     "rms_counts": "counts",
     "peak_counts": "counts",
     "ts20_s": "s",
@@ -32,14 +33,33 @@ UNITS: Final = {
 }
 """Figures that can carry a bound, and their units."""
 _SETTLED_RAD: Final = 0.020
-_SETTLED_SHARE: Final = 0.1  # of |S(0)|
-_SMALLEST_S0_rad_s: Final = 0.1  # below this there is no initial error whose decay means anything
+_LENGTH_TOLERANCE_S: Final = 0.005  # the last sample lies a cycle or a few before the end
 _DEFAULT_STAT_SHARE: Final = 0.6  # of a run without a scenario, as 12 s of 20 s
-_SMOOTHING_HALF_WIDTH_S: Final = 12e-3
 
 
 class MetricsError(HilError):
     """The samples hold no run from which figures can be taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoundResult:
+    """One figure against its bound.
+
+    Attributes:
+        name: Key of `UNITS`; `... (true)` where the plant's truth was judged by the same bound.
+        joint: From 1; 0 for the run as a whole.
+        value: As measured.
+        low: Smallest value that passes.
+        high: Largest value that passes.
+        passed: The value lies in the range; NaN never does.
+    """
+
+    name: str
+    joint: int
+    value: float
+    low: float
+    high: float
+    passed: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,16 +146,16 @@ def measure(samples: Records, *, stat_start_s: float | None = None) -> Metrics:
             f"the trajectory ends at {t_s[-1]:.3f} s, its statistics start at {start_s:g} s:"
             " let it run to its end"
         )
-    has_truth = _has_truth(run)
+    is_simulated = has_truth(run)
     torque = run["tau_sent_Nm"]
     variation = np.abs(np.diff(torque[steady], axis=0)).sum(axis=0)
     return Metrics(
         duration_s=float(t_s[-1]),
         stat_start_s=start_s,
         measured=_tracking(run, "q_meas_rad", steady),
-        true=_tracking(run, "q_true_rad", steady) if has_truth else None,
+        true=_tracking(run, "q_true_rad", steady) if is_simulated else None,
         rate10_1_s=_per_joint(decay_rates(run)),
-        is_rate_from_truth=has_truth,
+        is_rate_from_truth=is_simulated,
         tv_Nm_s=_per_joint(variation / np.ptp(t_s[steady])),
         peak_tau_Nm=_per_joint(np.abs(torque).max(axis=0)),
         Kd_min=_per_joint(run["Kd"].min(axis=0)),
@@ -187,10 +207,6 @@ def _spread_us(values_ns: NDArray[np.int32]) -> tuple[float, float, float]:
     return float(p50), float(p99), float(worst)
 
 
-def _has_truth(rows: Records) -> bool:
-    return "q_true_rad" in (rows.dtype.names or ()) and bool(np.isfinite(rows["q_true_rad"]).all())
-
-
 def _per_joint(values: Array) -> PerJoint:
     return tuple(float(value) for value in values)
 
@@ -206,66 +222,76 @@ def _tracking(rows: Records, position: str, steady: NDArray[np.bool_]) -> Tracki
     )
 
 
-def decay_rates(rows: Records) -> Array:
-    """Return ln 10 / (first time |S| < 10 % of |S(0)|) per joint, with S free of encoder noise.
+def check(metrics: Metrics, scenario: Scenario) -> list[BoundResult]:
+    """Hold a run's figures against the bounds of its scenario.
 
-    In simulation S is built from the plant's own position and rate; otherwise from the encoder's
-    position smoothed without lag. Either way alpha and Ki are those the recorded S was made with.
+    Position errors are judged as the encoder saw them and, in simulation, as they truly were: a
+    wrongly scaled encoder shows in the second alone.
+
+    Returns:
+        One result per figure and joint, the length of the run first. A joint that the arm does
+        not have fails.
     """
-    S = np.abs(_noise_free_manifold(rows))
-    t_s = rows["t_ref_s"]
-    rates = np.full(S.shape[1], np.nan)
-    for joint, column in enumerate(S.T):
-        settled = np.flatnonzero(column < _SETTLED_SHARE * column[0])
-        if len(settled) and column[0] > _SMALLEST_S0_rad_s and t_s[settled[0]] > 0.0:
-            rates[joint] = math.log(10.0) / t_s[settled[0]]
-    return rates
+    shortest_s = scenario.duration_s - _LENGTH_TOLERANCE_S
+    results = [_judge("duration_s", 0, metrics.duration_s, (shortest_s, math.inf))]
+    for bound in scenario.bounds:
+        for name, values in _figures(metrics, bound.metric):
+            value = values[bound.joint - 1] if bound.joint <= len(values) else math.nan
+            results.append(_judge(name, bound.joint, value, (bound.low, bound.high)))
+    return results
 
 
-def _noise_free_manifold(rows: Records) -> Array:
-    if _has_truth(rows):
-        q, dq = rows["q_true_rad"], rows["dq_true_rad_s"]
-    else:
-        q, dq = smoothed_motion(rows["t_ref_s"], rows["q_meas_rad"])
-    S = np.array(rows["S_rad_s"], dtype=np.float64)
-    for joint in range(S.shape[1]):
-        error = rows["q_meas_rad"][:, joint] - rows["q_des_rad"][:, joint]
-        rate_error = rows["dq_meas_rad_s"][:, joint] - rows["dq_des_rad_s"][:, joint]
-        # S = dq_err + alpha q_err + Ki sigma, paper (6), (7): exact, so two gains are found exactly
-        terms = np.column_stack((error, rows["sigma"][:, joint]))
-        alpha = np.linalg.lstsq(terms, S[:, joint] - rate_error)[0][0]
-        S[:, joint] += dq[:, joint] - rows["dq_meas_rad_s"][:, joint]
-        S[:, joint] += alpha * (q[:, joint] - rows["q_meas_rad"][:, joint])
-    return S
+def _judge(name: str, joint: int, value: float, limits: tuple[float, float]) -> BoundResult:
+    low, high = limits
+    return BoundResult(name, joint, value, low, high, passed=low <= value <= high)
 
 
-def smoothed_motion(t_s: Array, q_rad: Array) -> tuple[Array, Array]:
-    """Return position and rate from sampled positions, without lag.
-
-    A quadratic is fitted around every sample (over 12 ms to each side; at the ends over the first
-    and last 24 ms), after the samples have been brought to an even grid.
-
-    Args:
-        t_s: Rising instants; skipped cycles leave gaps.
-        q_rad: One column per joint.
-    """
-    dt_s = float(np.median(np.diff(t_s)))
-    grid_s = np.arange(t_s[0], t_s[-1] + dt_s / 2, dt_s)
-    half = min(round(_SMOOTHING_HALF_WIDTH_S / dt_s), (len(grid_s) - 1) // 2)
-    smooth, rate = np.empty_like(q_rad), np.empty_like(q_rad)
-    for joint in range(q_rad.shape[1]):
-        fits = _local_quadratics(np.interp(grid_s, t_s, q_rad[:, joint]), half)
-        smooth[:, joint] = np.interp(t_s, grid_s, fits[0])
-        rate[:, joint] = np.interp(t_s, grid_s, fits[1] / dt_s)
-    return smooth, rate
+def _figures(metrics: Metrics, name: str) -> Iterator[tuple[str, PerJoint]]:
+    if hasattr(metrics, name):
+        yield name, getattr(metrics, name)
+        return
+    yield name, getattr(metrics.measured, name)
+    if metrics.true is not None:
+        yield f"{name} (true)", getattr(metrics.true, name)
 
 
-def _local_quadratics(values: Array, half: int) -> tuple[Array, Array]:
-    """Return value and slope per sample of the quadratic fitted around each sample."""
-    offsets = np.arange(-half, half + 1, dtype=np.float64)
-    solver = np.linalg.pinv(np.vander(offsets, 3, increasing=True))
-    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * half + 1)
-    level, slope, bend = solver @ windows.T
-    centre = np.clip(np.arange(len(values)), half, len(values) - 1 - half)
-    x, at = np.arange(len(values)) - centre, centre - half
-    return level[at] + slope[at] * x + bend[at] * x * x, slope[at] + 2.0 * bend[at] * x
+def format_table(results: Sequence[BoundResult]) -> str:
+    """Format a verdict as an aligned text table, one line per figure and a last line of count."""
+    rows: list[tuple[str, ...]] = [("figure", "joint", "value", "bound", "unit", "verdict")]
+    rows += [_table_row(result) for result in results]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(_align(row, widths)).rstrip() for row in rows]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    failed = sum(not result.passed for result in results)
+    verdict = f"{failed} of {len(results)} bounds FAIL" if failed else "all bounds PASS"
+    return "\n".join((*lines, "", f"{verdict} ({len(results)} checked)" if not failed else verdict))
+
+
+def _table_row(result: BoundResult) -> tuple[str, ...]:
+    return (
+        result.name,
+        str(result.joint) if result.joint else "-",
+        format_figure(result.value),
+        _format_range(result.low, result.high),
+        UNITS[result.name.removesuffix(" (true)")],
+        "PASS" if result.passed else "FAIL",
+    )
+
+
+def _align(row: tuple[str, ...], widths: list[int]) -> Iterator[str]:
+    for column, (cell, width) in enumerate(zip(row, widths, strict=True)):
+        yield cell.rjust(width) if column == 2 else cell.ljust(width)
+
+
+def format_figure(value: float) -> str:
+    """Format with four significant digits, and never an exponent for what runs produce."""
+    if not math.isfinite(value) or value == 0.0:
+        return f"{value:g}"
+    digits = max(0, 3 - math.floor(math.log10(abs(value))))
+    return f"{value:.{min(digits, 6)}f}"
+
+
+def _format_range(low: float, high: float) -> str:
+    if high == math.inf:
+        return f">= {low:g}"
+    return f"<= {high:g}" if low == 0.0 else f"{low:g} .. {high:g}"

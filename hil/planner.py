@@ -114,7 +114,7 @@ def plan(
 def _plan_curve(
     request: _CurveRequest, state: MotionState, limits: MotionLimits, period_s: float
 ) -> Reference:
-    _require_duration(_requested_s(request), limits)
+    _require_duration("the trajectory", _requested_s(request), limits)
     with _refusing():
         curve = _compile(request, period_s)
         _require_joints(curve.joints, limits)
@@ -123,7 +123,7 @@ def _plan_curve(
     with _refusing("braking at the end: "):
         braking = [] if curve.end.is_at_rest else [trajectory.brake(curve.end, limits, period_s)]
     whole = concatenate([*approach, curve, *braking])
-    _require_duration(whole.duration_s, limits)
+    _require_duration("the motion with approach and braking", whole.duration_s, limits)
     return whole
 
 
@@ -205,7 +205,7 @@ def _plan_move(
     _require_joints(len(request.target_rad), limits)
     _require_target(request.target_rad, limits)
     profile = _move_profile(request, state, limits)
-    _require_duration(profile.duration, limits)
+    _require_duration("the move", profile.duration, limits)
     periods = max(1, ceil(profile.duration / period_s - 1e-6))
     instants = (min(k * period_s, profile.duration) for k in range(periods + 1))
     motion = np.array([profile.at_time(t) for t in instants])
@@ -265,11 +265,11 @@ def _require_joints(joints: int, limits: MotionLimits) -> None:
         )
 
 
-def _require_duration(duration_s: float, limits: MotionLimits) -> None:
+def _require_duration(what: str, duration_s: float, limits: MotionLimits) -> None:
     if not duration_s <= limits.max_duration_s + 1e-9:
         value, limit = distinct(duration_s, limits.max_duration_s)
         raise Refusal(
-            f"a motion of {value} s is beyond the longest allowed, {limit} s",
+            f"{what} takes {value} s, beyond the longest allowed, {limit} s",
             "duration",
             value=duration_s,
             limit=limits.max_duration_s,

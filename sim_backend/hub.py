@@ -227,10 +227,12 @@ class UnixHub(Wire):
                 client.put(frame)
 
     def _accept(self) -> None:
-        try:
-            endpoint, _ = self._listener.accept()
-        except OSError:
-            return  # gone again
+        """Take in all who have connected: nobody who waits here may miss a frame sent later."""
+        with suppress(OSError):  # nobody left, or gone again
+            while True:
+                self._take_in(self._listener.accept()[0])
+
+    def _take_in(self, endpoint: socket.socket) -> None:
         if len(self._clients) >= _CLIENT_LIMIT:
             endpoint.close()
             return

@@ -182,7 +182,7 @@ class Cia402Node(AmplifierNode):
     def _set_consumer(self, setting: int) -> None:
         self.dictionary.values[key_of(Index.CONSUMER_HEARTBEAT, 1)] = setting
         self._consumer.watch(setting)
-        self._emergency.clear(EmcyCode.HEARTBEAT_LOST)
+        self._recover_from(EmcyCode.HEARTBEAT_LOST)
         self._route()
 
     def _inject_fault(self, number: int) -> None:
@@ -232,9 +232,10 @@ class Cia402Node(AmplifierNode):
         self.nmt_state = state
         for pdo in (*self._rpdos, *self._tpdos):
             pdo.forget()
-        self._sdo_server.reset()
-        if state is NmtState.OPERATIONAL and not self.drive.machine.is_faulted:
-            self._emergency.clear(EmcyCode.COMMUNICATION)
+        if state is NmtState.STOPPED:
+            self._sdo_server.reset()
+        if state is NmtState.OPERATIONAL:
+            self._recover_from(EmcyCode.COMMUNICATION)
         self._route()
 
     def _leave_operational(self) -> None:
@@ -246,8 +247,9 @@ class Cia402Node(AmplifierNode):
         """Rebuild the handlers by identifier that the NMT state allows."""
         state = self.nmt_state
         is_operational = state is NmtState.OPERATIONAL
-        self._sync_rpdos = [rpdo for rpdo in self._rpdos if rpdo.is_on and rpdo.is_synchronous]
-        self._watched_rpdos = [rpdo for rpdo in self._rpdos if rpdo.is_on and is_operational]
+        rpdos = [rpdo for rpdo in self._rpdos if rpdo.is_on and is_operational]
+        self._sync_rpdos = [rpdo for rpdo in rpdos if rpdo.is_synchronous]
+        self._watched_rpdos = [rpdo for rpdo in rpdos if rpdo.event_timer_s]
         tpdos = [tpdo for tpdo in self._tpdos if tpdo.is_on and is_operational]
         self._sync_tpdos = [tpdo for tpdo in tpdos if not tpdo.is_event_driven]
         self._timed_tpdos = [tpdo for tpdo in tpdos if tpdo.is_event_driven]
@@ -261,7 +263,7 @@ class Cia402Node(AmplifierNode):
             self._handlers[COB_SDO_RX + self.node_id] = self._sdo_server.receive
         if is_operational:
             self._handlers[COB_SYNC] = self._on_sync
-            self._handlers |= {rpdo.can_id: rpdo.receive for rpdo in self._watched_rpdos}
+            self._handlers |= {rpdo.can_id: rpdo.receive for rpdo in rpdos}
 
     def _send(self, can_id: int, data: bytes) -> None:
         if self.nmt_state is NmtState.STOPPED and can_id < COB_HEARTBEAT:
@@ -281,9 +283,13 @@ class Cia402Node(AmplifierNode):
     # --- loss of the master -------------------------------------------------------------------
 
     def _on_heartbeat(self, data: bytes) -> None:
-        is_back = self._consumer.receive(data)
-        if is_back and not self.drive.machine.is_faulted:
-            self._emergency.clear(EmcyCode.HEARTBEAT_LOST)
+        if self._consumer.receive(data):
+            self._recover_from(EmcyCode.HEARTBEAT_LOST)
+
+    def _recover_from(self, code: EmcyCode) -> None:
+        """The cause is gone; if it made the drive fail, it stays until the fault is reset."""
+        if not self.drive.machine.is_faulted:
+            self._emergency.clear(code)
 
     def _lose_connection(self, code: EmcyCode, rpdo: Rpdo | None = None) -> None:
         """React as 6007 says if the drive is powered, and report it in any case."""

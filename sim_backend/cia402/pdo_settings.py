@@ -1,5 +1,6 @@
 """What a master may write to a PDO's parameter and mapping objects (CiA 301, 7.5.2.35 to 38)."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
 from typing import ClassVar
@@ -17,7 +18,7 @@ _FREE_COB_IDS = (range(0x181, 0x580), range(0x680, 0x6E0))  # 7.3.5: the others 
 _BITS = {"b": 8, "B": 8, "h": 16, "H": 16, "i": 32, "I": 32}
 
 
-class PdoSettings:
+class PdoSettings(ABC):
     """One PDO's settings in the object dictionary; refuses what the standard does not allow.
 
     The order a master has to keep: switch the PDO off (bit 31 of its COB-ID), set the number of
@@ -43,6 +44,14 @@ class PdoSettings:
         bind(self._mapping, 0, write=self._write_count)
         for subindex in range(1, MAPPING_ENTRIES + 1):
             bind(self._mapping, subindex, write=partial(self._write_object, subindex))
+
+    @abstractmethod
+    def compile(self) -> None:
+        """Take over the settings."""
+
+    @abstractmethod
+    def forget(self) -> None:
+        """Start afresh, as on every change of the NMT state."""
 
     def _value(self, subindex: int) -> int:
         return self._dictionary.values[key_of(self._parameter, subindex)]

@@ -128,7 +128,7 @@ def measure(
         if case.law is free:
             energy = max(energy, abs(arm.energy_J() - start_J) / (start_J - rest_J))
         q_first = q if k < 1000 else q_first
-        if stop_beyond and k % 100 == 0:
-            if not Errors(q, q_first, dq, energy).is_within(stop_beyond):
-                break
-    return Errors(q, q_first, dq, energy)
+        errors = Errors(q, q_first, dq, energy)
+        if stop_beyond and not errors.is_within(stop_beyond):
+            break
+    return errors

@@ -1,4 +1,4 @@
-"""The simulated arm against the Lagrange equations, and deliberately wrong arms against its bounds."""
+"""The simulated arm against the Lagrange equations, and wrong arms against its bounds."""
 
 import random
 from math import pi
