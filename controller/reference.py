@@ -120,13 +120,6 @@ class Violation:
     limit: float
     time_s: float
 
-    @property
-    def overshoot(self) -> float:
-        """Distance beyond the limit, relative to it; infinite if the value is not finite."""
-        if not np.isfinite(self.value):
-            return float("inf")
-        return abs(self.value - self.limit) / (1e-3 + abs(self.limit))
-
     def __str__(self) -> str:
         head = f"joint {self.joint}: {self.quantity}"
         if not np.isfinite(self.value):

@@ -8,7 +8,7 @@ matter of `Reference.check`, except where a motion is made as short as the limit
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import ceil, floor, isfinite, pi
+from math import ceil, floor, inf, isfinite, pi
 from types import MappingProxyType
 
 import numpy as np
@@ -279,11 +279,17 @@ def _bracket(violation: Callable[[int], Violation | None], most: int) -> tuple[i
         beyond = violation(periods)
         if beyond is None:
             return failed, periods
-        if closest is None or beyond.overshoot < closest.overshoot:
+        if closest is None or _gravity(beyond) < _gravity(closest):
             closest = beyond
         if periods == most:
             raise LimitError(closest)
         failed, periods = periods, min(most, periods + 1 + periods // 5)
+
+
+def _gravity(beyond: Violation) -> tuple[bool, float]:
+    """Order violations: too little room says more than too little time, then the smaller counts."""
+    excess = abs(beyond.value - beyond.limit) / (1e-3 + abs(beyond.limit))
+    return beyond.quantity != "position", excess if isfinite(excess) else inf
 
 
 def _smooth_step(t: FloatArray, rise_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -319,8 +325,11 @@ def _table(rows: Sequence[Sequence[float]]) -> FloatArray:
 
 
 def _require_resolved(w_rad_s: float, period_s: float) -> None:
-    most = 2.0 * pi / (_SAMPLES_PER_CYCLE * period_s)
-    _require(w_rad_s <= most, f"{w_rad_s:g} rad/s is beyond the {most:g} rad/s that can be sampled")
+    _require(
+        _SAMPLES_PER_CYCLE * w_rad_s * period_s <= 2.0 * pi,
+        f"{w_rad_s:g} rad/s is too fast for samples {period_s:g} s apart: "
+        f"fewer than {_SAMPLES_PER_CYCLE} in a cycle",
+    )
 
 
 def _require(condition: object, message: str) -> None:

@@ -23,6 +23,7 @@ class Executor:
 
     Attributes:
         active_slot: Slot of the trajectory that was started last, -1 before the first.
+        active_samples: Its number of rows.
     """
 
     def __init__(self, control: Control, rows: Rows, outcome: Outcome) -> None:
@@ -31,6 +32,7 @@ class Executor:
         self._outcome = outcome
         self._pending: Mapping[str, Any] | None = None
         self.active_slot = -1
+        self.active_samples = 0
         self._verbs: dict[str, Callable[[Mapping[str, Any]], None]] = {
             "enable": lambda _: control.enable(),
             "disable": self._disable,
@@ -62,7 +64,7 @@ class Executor:
     def _start(self, command: Mapping[str, Any]) -> None:
         rows = self._rows(command["slot"])
         self._control.start(rows, command["samples"], at_index=command["at_index"])
-        self.active_slot = command["slot"]
+        self.active_slot, self.active_samples = command["slot"], command["samples"]
 
     def _disable(self, _: Mapping[str, Any]) -> None:
         self._drop_pending("the arm was disabled")

@@ -29,9 +29,8 @@ from hil.realtime import (
     usage,
 )
 from hil.sampler import Sampler, Stamps
-from hil.shared import SharedMemory
+from hil.shared import STATUS_EVERY_S, SharedMemory
 
-STATUS_EVERY_S = 0.1
 GATEWAY_TIMEOUT_NS = 1_000_000_000
 FAREWELL_CYCLES = 5
 """Cycles run after power went off, so that every amplifier has the last word."""
@@ -133,6 +132,7 @@ class Loop:
                 "samples": self._sampler.seq,
                 "overruns": self._overruns,
                 "active_slot": self._executor.active_slot,
+                "active_samples": self._executor.active_samples,
                 "frames_sent": bus.stats.frames_sent,
                 "frames_received": bus.stats.frames_received,
                 "send_failures": bus.stats.send_failures,

@@ -131,7 +131,7 @@ class MoveRequest(_Request):
     kind: Literal["move"] = "move"
     target_rad: Joints
     speed_scale: Real = Field(
-        1.0, gt=0, le=1, description="slows the whole move: half takes twice the time from rest"
+        1.0, ge=0.001, le=1, description="slows the whole move: half takes twice the time from rest"
     )
 
 

@@ -105,6 +105,7 @@ def plan(
     Raises:
         Refusal: If the request does not fit the arm, or no plan keeps the limits.
     """
+    _require_joints("the present reference", len(state.q_rad), limits)
     with np.errstate(all="ignore"):  # what overflows is not finite, and is refused for that
         if isinstance(request, MoveRequest):
             return _plan_move(request, state, limits, period_s)
@@ -117,7 +118,7 @@ def _plan_curve(
     _require_duration("the trajectory", _requested_s(request), limits)
     with _refusing():
         curve = _compile(request, period_s)
-        _require_joints(curve.joints, limits)
+        _require_joints("the trajectory", curve.joints, limits)
         _require_within(curve, limits)
     approach = _approach(request, state, curve.start, limits, period_s)
     with _refusing("braking at the end: "):
@@ -202,7 +203,7 @@ def _shortest_blend(
 def _plan_move(
     request: MoveRequest, state: MotionState, limits: MotionLimits, period_s: float
 ) -> Reference:
-    _require_joints(len(request.target_rad), limits)
+    _require_joints("the target", len(request.target_rad), limits)
     _require_target(request.target_rad, limits)
     profile = _move_profile(request, state, limits)
     _require_duration("the move", profile.duration, limits)
@@ -255,10 +256,10 @@ def _require_within(motion: Reference, limits: MotionLimits) -> None:
         raise Refusal.beyond(violation)
 
 
-def _require_joints(joints: int, limits: MotionLimits) -> None:
+def _require_joints(what: str, joints: int, limits: MotionLimits) -> None:
     if joints != limits.joints:
         raise Refusal(
-            f"the trajectory is for {joints} joints, the arm has {limits.joints}",
+            f"{what} has {joints} joints, the arm has {limits.joints}",
             "joints",
             value=joints,
             limit=limits.joints,

@@ -24,6 +24,8 @@ _HEAD = struct.Struct("<QQ")  # sequence number + 1, payload length
 _TAIL_SIZE = 8
 _CONFIG_SIZE = 64 << 10
 _EVENT_BYTES = 2048
+STATUS_EVERY_S: Final = 0.1
+"""Period of the loop's status."""
 SLOTS: Final = 3
 """Trajectory slots: one being played, one waiting, one being written."""
 
@@ -163,7 +165,11 @@ class SharedMemory:
 
     def rows(self, slot: int) -> "memoryview[float]":
         """Return the flat doubles of a trajectory slot."""
-        return self._view(f"slot{slot}").cast("d")
+        return self.slot(slot).cast("d")
+
+    def slot(self, slot: int) -> memoryview:
+        """Return the bytes of a trajectory slot."""
+        return self._view(f"slot{slot}")
 
     # Counters, each with one writer.
 

@@ -111,8 +111,7 @@ class Simulation:
 
     def play(self, reference: Reference) -> None:
         """Start a compiled reference at the next cycle, as the trajectory command does."""
-        rows = reference.rows().ravel()
-        self._rows[0] = memoryview(rows)
+        self._rows[0] = memoryview(reference.rows().tobytes()).cast("d")
         self._executor.execute(
             {
                 "id": 0,

@@ -74,14 +74,12 @@ def open_wire(address: str) -> Wire:
     """Open the emulator's side of the bus at `address` (`drivers.bus` lists the forms).
 
     Raises:
-        BusAddressError: If the address cannot be understood.
-        SimError: If the bus is not there, or another emulator is.
+        SimError: If the address cannot be understood, the bus is not there, or another emulator
+            is.
     """
-    scheme, rest = split_address(address)
-    if scheme == "unix":
-        return UnixHub(rest)
     try:
-        return BusWire(open_bus(address))
+        scheme, rest = split_address(address)
+        return UnixHub(rest) if scheme == "unix" else BusWire(open_bus(address))
     except BusError as error:
         raise SimError(str(error)) from error
 
@@ -251,11 +249,10 @@ class UnixHub(Wire):
         """Hang up on all clients and remove the socket file."""
         for fd in list(self._clients):
             self._let_go(fd)
-        if self._listener.fileno() >= 0:
-            self._listener.close()
-            self._remove_file()
-
-    def _remove_file(self) -> None:
+        if self._listener.fileno() < 0:
+            return
+        self._listener.close()
+        self._readable = [-1]  # the number may soon be somebody else's
         path = Path(self.path)
         with suppress(OSError):
             if path.stat().st_ino == self._inode:  # not somebody else's by now

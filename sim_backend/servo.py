@@ -15,7 +15,8 @@ class Servo:
     with the plant's motion and `drive` once per current-loop period.
 
     Attributes:
-        torque_target_Nm: Demanded joint torque, positive about the joint's axis.
+        torque_target_Nm: Demanded joint torque, positive about the joint's axis. NaN, which some
+            protocols can carry, demands none.
         is_energised: Power stage on. When off the winding is open: no current, no torque.
         current_A: Winding current at the end of the last current-loop period.
         q_rad: Joint angle as last sensed (the plant's truth; nodes read `counts`).
@@ -24,12 +25,17 @@ class Servo:
     """
 
     __slots__ = (
+        "_current_max_A",
         "_decay",
         "_gain",
         "_integral_V",
+        "_integral_gain",
         "_mean_weight",
         "_per_turn",
         "_per_turn_rad",
+        "_resistance_ohm",
+        "_supply_V",
+        "_torque_constant_Nm_A",
         "current_A",
         "dq_rad_s",
         "is_energised",
@@ -54,6 +60,11 @@ class Servo:
         # PI with its zero on the winding's pole: the closed loop is one pole at the bandwidth.
         pole = math.exp(-TAU * settings.bandwidth_Hz * CURRENT_LOOP_PERIOD_S)
         self._gain = (1.0 - pole) * settings.resistance_ohm / (1.0 - self._decay)
+        self._integral_gain = self._gain * (1.0 - self._decay)
+        self._torque_constant_Nm_A = settings.torque_constant_Nm_A
+        self._resistance_ohm = settings.resistance_ohm
+        self._current_max_A = settings.current_max_A
+        self._supply_V = settings.supply_V
         self._per_turn = 1 << settings.encoder_bits
         self._per_turn_rad = self._per_turn / TAU
 
@@ -90,18 +101,25 @@ class Servo:
             self._integral_V = 0.0
             self.is_saturated = False
             return 0.0
-        s = self.settings
-        demand_A = self.torque_target_Nm / s.torque_constant_Nm_A
-        limited_A = max(-s.current_max_A, min(s.current_max_A, demand_A))
-        error_A = limited_A - self.current_A
-        wanted_V = self._gain * error_A + self._integral_V
-        voltage_V = max(-s.supply_V, min(s.supply_V, wanted_V))
-        is_clipped = voltage_V != wanted_V
-        if not is_clipped:  # the integral waits while the supply limits
-            self._integral_V += self._gain * (1.0 - self._decay) * error_A
-        self.is_saturated = is_clipped or limited_A != demand_A
-        settled_A = (voltage_V - s.torque_constant_Nm_A * self.dq_rad_s) / s.resistance_ohm
+        demand_A = self.torque_target_Nm / self._torque_constant_Nm_A
+        limited_A = _clip(demand_A, self._current_max_A)
         before_A = self.current_A
+        error_A = limited_A - before_A
+        wanted_V = self._gain * error_A + self._integral_V
+        voltage_V = _clip(wanted_V, self._supply_V)
+        if voltage_V == wanted_V:  # the integral waits while the supply limits
+            self._integral_V += self._integral_gain * error_A
+        self.is_saturated = voltage_V != wanted_V or limited_A != demand_A
+        settled_A = (voltage_V - self._torque_constant_Nm_A * self.dq_rad_s) / self._resistance_ohm
         self.current_A = settled_A + (before_A - settled_A) * self._decay
         mean_A = settled_A + (before_A - settled_A) * self._mean_weight
-        return mean_A * s.torque_constant_Nm_A
+        return mean_A * self._torque_constant_Nm_A
+
+
+def _clip(value: float, limit: float) -> float:
+    """Limit to +-`limit`; NaN becomes 0."""
+    if -limit <= value <= limit:
+        return value
+    if value > limit:
+        return limit
+    return -limit if value < -limit else 0.0

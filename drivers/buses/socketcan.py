@@ -146,6 +146,7 @@ class SocketCanBus(Bus):
     def close(self) -> None:
         """Close the socket. Frames already queued are still sent."""
         self._socket.close()
+        self._readable = (-1,)  # the number may soon be somebody else's
 
 
 def _exactly(can_id: int) -> tuple[int, int]:

@@ -120,6 +120,7 @@ class UnixBus(Bus):
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits in `recv`
         self._socket.close()
+        self._readable = (-1,)  # the number may soon be somebody else's
 
 
 def _connect(path: str) -> socket.socket:

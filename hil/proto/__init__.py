@@ -1,0 +1,1 @@
+"""Generated from telemetry.proto; see `make proto`."""

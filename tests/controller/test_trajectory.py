@@ -1,5 +1,3 @@
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -42,34 +40,45 @@ TIMES = [0.0, 0.7, 1.0, 2.5, 3.1]
 POINTS = [[0.0, 0.1], [0.4, 0.0], [0.5, -0.2], [-0.3, 0.3], [0.1, 0.1]]
 
 
-def example_references():
-    rows = kelly(5e-3, 6.0, 0.5).q_rad
-    return {
-        "kelly": kelly(T, 8.0, 0.5),
-        "sinusoid": sinusoid(T, 6.0, SINE),
-        "waypoints": waypoints(T, TIMES, POINTS),
-        "samples": samples(T, 5e-3, rows.tolist()),
-        "blend": blend(state([0, 0], [1, -1], [3, 4]), state([1, 0], [0, 1], [-5, 2]), 0.8, T),
-        "brake": brake(state([0, 0], [2, -1], [5, 0]), LIMITS, T),
-    }
-
-
 def state(q, dq, ddq):
     return MotionState(np.array(q, float), np.array(dq, float), np.array(ddq, float))
 
 
-def assert_consistent(reference, tolerance=1e-4):
-    """Neighbouring samples agree with dq being the slope of q and ddq that of dq.
+ROWS = kelly(5e-3, 6.0, 0.5).q_rad.tolist()
+MOVING = state([0, 0], [1, -1], [3, 4])
+KINDS = {  # name -> reference, given the period
+    "kelly": lambda period: kelly(period, 8.0, 0.5),
+    "sinusoid": lambda period: sinusoid(period, 6.0, SINE),
+    "waypoints": lambda period: waypoints(period, TIMES, POINTS),
+    "samples": lambda period: samples(period, 5e-3, ROWS),
+    "blend": lambda period: blend(MOVING, state([1, 0], [0, 1], [-5, 2]), 0.8, period),
+    "brake": lambda period: brake(state([0, 0], [2, -1], [5, 0]), LIMITS, period),
+    "joined": lambda period: joined(kelly(period, 3.0, 0.5)),
+}
 
-    Simpson's rule needs the middle sample: a jump of q, dq or ddq anywhere breaks it.
-    """
+
+def joined(curve):
+    approach = blend(MotionState.at_rest([0.4, -0.5]), curve.start, 0.5, curve.period_s)
+    return concatenate([approach, curve, brake(curve.end, LIMITS, curve.period_s)])
+
+
+def assert_consistent(reference):
+    """dq is the slope of q, and ddq that of dq, as far as the samples can tell."""
     for x, dx in (
         (reference.q_rad, reference.dq_rad_s),
         (reference.dq_rad_s, reference.ddq_rad_s2),
     ):
-        integral = (dx[:-2] + 4.0 * dx[1:-1] + dx[2:]) * reference.period_s / 3.0
-        scale = reference.period_s * max(1.0, float(np.abs(dx).max()))
-        np.testing.assert_allclose(x[2:] - x[:-2], integral, rtol=0, atol=tolerance * scale)
+        gap = np.diff(x, axis=0) - 0.5 * reference.period_s * (dx[1:] + dx[:-1])
+        bend = np.abs(np.diff(dx, axis=0)).max()
+        assert np.abs(gap).max() <= 0.5 * reference.period_s * bend + 1e-12
+
+
+def assert_c2(make):
+    """Steps between samples halve with the period; across a jump they would stay."""
+    coarse, fine = make(T), make(T / 2)
+    for name in ("q_rad", "dq_rad_s", "ddq_rad_s2"):
+        steps = [np.abs(np.diff(getattr(r, name), axis=0)).max(axis=0) for r in (coarse, fine)]
+        assert (steps[1] <= 0.55 * steps[0]).all(), name
 
 
 def assert_same(a, b, atol=1e-12):
@@ -167,7 +176,7 @@ def test_waypoints__end_between_two_periods__last_sample_is_the_last_point():
 
 @settings(max_examples=40, deadline=None)
 @given(
-    gaps=st.lists(st.floats(0.002, 5.0), min_size=1, max_size=12),
+    gaps=st.lists(st.floats(0.02, 5.0), min_size=1, max_size=12),
     seed=st.integers(0, 2**32 - 1),
 )
 def test_waypoints__any_times__is_c2_through_every_point(gaps, seed):
@@ -175,11 +184,9 @@ def test_waypoints__any_times__is_c2_through_every_point(gaps, seed):
     points = np.random.default_rng(seed).uniform(-1.0, 1.0, (len(times), 2))
     reference = waypoints(T, times.tolist(), points.tolist())
     at = np.minimum(np.round(times / T).astype(int), reference.samples - 1)
-    dq_max = np.abs(reference.dq_rad_s).max() + np.abs(reference.ddq_rad_s2).max() * T
-    np.testing.assert_allclose(reference.q_rad[at], points, atol=1e-9 * (1.0 + dq_max))
-    dq_jump = np.abs(np.diff(reference.dq_rad_s, axis=0)).max()
-    # A gap of g seconds bends no faster than a move of 2 rad with the spline's bounds does.
-    assert np.isfinite(dq_jump)
+    scale = 1.0 + np.abs(reference.q_rad).max()
+    np.testing.assert_allclose(reference.q_rad[at], points, atol=1e-9 * scale)
+    assert_consistent(reference)
     assert_same(reference.start, MotionState.at_rest(points[0]))
     assert_same(reference.end, MotionState.at_rest(points[-1]))
 
@@ -215,23 +222,21 @@ def test_samples__of_a_known_motion__gives_its_derivatives(sample_period_s):
 # --- continuity ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", list(example_references()))
-def test_reference__every_kind__is_c2(name):
-    reference = example_references()[name]
-    assert_consistent(reference)
-    rate = np.abs(np.diff(reference.dq_rad_s, axis=0)).max() / T
-    assert rate <= np.abs(reference.ddq_rad_s2).max() * (1.0 + 1e-9)
-    speed = np.abs(np.diff(reference.q_rad, axis=0)).max() / T
-    assert speed <= np.abs(reference.dq_rad_s).max() * (1.0 + 1e-9)
+@pytest.mark.parametrize("name", KINDS)
+def test_reference__every_kind__is_c2_and_its_derivatives_are_its_slopes(name):
+    assert_c2(KINDS[name])
+    assert_consistent(KINDS[name](T))
 
 
-def test_assert_consistent__a_small_jump_of_acceleration__is_noticed():
-    reference = kelly(T, 4.0, 0.5)
-    ddq = reference.ddq_rad_s2.copy()
-    ddq[2000:] += 0.01
-    broken = Reference(reference.q_rad, reference.dq_rad_s, ddq, T)
-    with pytest.raises(AssertionError):
-        assert_consistent(broken)
+def test_assert_c2__a_small_jump_of_acceleration__is_noticed():
+    def broken(period_s):
+        reference = kelly(period_s, 4.0, 0.5)
+        ddq = reference.ddq_rad_s2.copy()
+        ddq[len(ddq) // 2 :] += 0.05
+        return Reference(reference.q_rad, reference.dq_rad_s, ddq, period_s)
+
+    with pytest.raises(AssertionError, match="ddq_rad_s2"):
+        assert_c2(broken)
 
 
 # --- joining two motions ------------------------------------------------------------------------
@@ -248,10 +253,7 @@ def test_blend__any_states__meets_both_exactly_and_is_c2(start, end, duration_s)
     reference = blend(start, end, duration_s, T)
     assert_same(reference.start, start, atol=0.0)
     assert_same(reference.end, end, atol=0.0)
-    jerk = np.abs(np.diff(reference.ddq_rad_s2, axis=0)).max() / T
-    acceleration = (np.diff(reference.dq_rad_s, axis=0) / T)[:, :]
-    middle = 0.5 * (reference.ddq_rad_s2[1:] + reference.ddq_rad_s2[:-1])
-    assert np.abs(acceleration - middle).max() <= jerk * T
+    assert_consistent(reference)
 
 
 @settings(max_examples=60, deadline=None)
@@ -259,8 +261,9 @@ def test_blend__any_states__meets_both_exactly_and_is_c2(start, end, duration_s)
 def test_approach_duration__any_states__is_within_limits_and_not_longer_than_needed(start, end):
     try:
         duration_s = approach_duration(start, end, LIMITS, T)
-    except LimitError as error:
-        assert error.violation.joint in (1, 2)
+    except LimitError:
+        fastest = max(np.abs(start.dq_rad_s).max(), np.abs(end.dq_rad_s).max())
+        assert fastest > 0.5  # between states nearly at rest there is always a way
         return
     assert blend(start, end, duration_s, T).check(LIMITS, with_jerk=True) is None
     periods = round(duration_s / T)
@@ -300,7 +303,7 @@ def test_brake__any_state__comes_to_rest_within_limits(start):
     assert_same(reference.start, start, atol=0.0)
     assert reference.end.is_at_rest
     assert reference.check(LIMITS, with_jerk=True) is None
-    assert_consistent(reference, tolerance=2e-2)
+    assert_consistent(reference)
 
 
 def test_brake__no_room__is_refused_with_the_position_limit():
@@ -314,12 +317,9 @@ def test_brake__no_room__is_refused_with_the_position_limit():
 
 def test_concatenate__pieces_that_meet__keeps_the_common_sample_once():
     curve = kelly(T, 3.0, 0.5)
-    start = MotionState.at_rest([0.4, -0.5])
-    approach = blend(start, curve.start, 0.5, T)
-    whole = concatenate([approach, curve, brake(curve.end, LIMITS, T)])
-    assert whole.q_rad[500].tolist() == curve.q_rad[0].tolist()
+    whole = joined(curve)
     np.testing.assert_array_equal(whole.q_rad[500:3501], curve.q_rad)
-    assert_consistent(whole)
+    np.testing.assert_array_equal(whole.ddq_rad_s2[500:3501], curve.ddq_rad_s2)
 
 
 @pytest.mark.parametrize("name", ["q_rad", "dq_rad_s", "ddq_rad_s2"])
@@ -370,6 +370,13 @@ def test_check__beyond_a_limit__says_which_where_and_when(
     assert (violation.quantity, violation.joint) == (quantity, 2)
     assert (violation.value, violation.limit) == (pytest.approx(value), limit)
     assert violation.time_s == pytest.approx(time_s)
+
+
+def test_check__motion_between_two_samples__does_not_hide():
+    step = waypoints(T, [0.0, T], [[0.0, 0.0], [0.5, 0.0]])  # at rest at both samples
+    violation = step.check(LIMITS)
+    assert violation is not None
+    assert (violation.quantity, violation.value) == ("velocity", pytest.approx(500.0))
 
 
 def test_check__jerk__is_checked_on_demand_only():
@@ -437,7 +444,7 @@ def test_motion_limits__from_settings__takes_every_field():
     fields = ("q_min_rad", "q_max_rad", "dq_max_rad_s", "ddq_max_rad_s2", "dddq_max_rad_s3")
     fields += ("following_error_rad",)
     given_values = {name: (float(i), i + 0.5) for i, name in enumerate(fields)}
-    rest = {name: (1.0, 1.0) for name in ("tau_max_Nm", "tau_slew_Nm_s", "damping_Nms_rad")}
+    rest = dict.fromkeys(("tau_max_Nm", "tau_slew_Nm_s", "damping_Nms_rad"), (1.0, 1.0))
     limits = MotionLimits.of(LimitSettings(**given_values, **rest), 7.0)
     assert {name: getattr(limits, name) for name in fields} == given_values
     assert limits.max_duration_s == 7.0
@@ -495,10 +502,9 @@ def test_trajectory__arguments_that_define_no_motion__is_an_error(make):
         make()
 
 
-def test_trajectory__same_arguments__same_bytes():
-    for a, b in pairwise([example_references(), example_references()]):
-        for name in a:
-            assert a[name].rows().tobytes() == b[name].rows().tobytes()
+@pytest.mark.parametrize("name", KINDS)
+def test_trajectory__same_arguments__same_bytes(name):
+    assert KINDS[name](T).rows().tobytes() == KINDS[name](T).rows().tobytes()
 
 
 def test_kelly__shape__is_the_published_one():

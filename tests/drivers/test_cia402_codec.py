@@ -10,6 +10,7 @@ from drivers.cia402.sdo import SdoAbort, SdoFrame, SdoKind
 from drivers.frame import pack_frame, unpack_frame
 
 NODE = 1
+SDO_RX, SDO_TX = codec.COB_SDO_RX + NODE, codec.COB_SDO_TX + NODE
 WIRE_BYTES = st.binary(max_size=8)
 INDICES = st.integers(0, 0xFFFF)
 SUBINDICES = st.integers(0, 0xFF)
@@ -31,35 +32,45 @@ GOLDEN_FRAMES = [
     ("181#3712FF0F00000CFE", codec.COB_TPDO1 + NODE, codec.TPDO1.pack(0x1237, 4095, -500)),
     ("281#FEFFFFFF6400", codec.COB_TPDO2 + NODE, codec.TPDO2.pack(-2, 100)),
     # write 6060 = 10, one byte: 2F = download, expedited, size given, 3 bytes unused
-    ("601#2F6060000A000000", codec.COB_SDO_RX + NODE, sdo.sdo_download_request(0x6060, 0, b"\x0a")),
-    ("601#2B171000F4010000", codec.COB_SDO_RX + NODE, sdo.sdo_download_request(0x1017, 0, codec.U16.pack(500))),
-    ("601#2300140101020080", codec.COB_SDO_RX + NODE, sdo.sdo_download_request(0x1400, 1, codec.U32.pack(0x80000201))),
-    ("601#2300160110004060", codec.COB_SDO_RX + NODE, sdo.sdo_download_request(0x1600, 1, codec.U32.pack(codec.RPDO1_MAP[0]))),
-    ("581#6060600000000000", codec.COB_SDO_TX + NODE, sdo.sdo_download_response(0x6060, 0)),
-    ("601#4041600000000000", codec.COB_SDO_RX + NODE, sdo.sdo_upload_request(0x6041, 0)),
-    ("581#4B41600037120000", codec.COB_SDO_TX + NODE, sdo.sdo_upload_response(0x6041, 0, b"\x37\x12")),
-    ("581#4F6160000A000000", codec.COB_SDO_TX + NODE, sdo.sdo_upload_response(0x6061, 0, b"\x0a")),
-    ("581#4300100092010200", codec.COB_SDO_TX + NODE, sdo.sdo_upload_response(0x1000, 0, codec.U32.pack(0x20192))),
+    ("601#2F6060000A000000", SDO_RX, sdo.sdo_download_request(0x6060, 0, b"\x0a")),
+    ("601#2B171000F4010000", SDO_RX, sdo.sdo_download_request(0x1017, 0, codec.U16.pack(500))),
+    (
+        "601#2300140101020080",
+        SDO_RX,
+        sdo.sdo_download_request(0x1400, 1, codec.U32.pack(0x80000201)),
+    ),
+    (
+        "601#2300160110004060",
+        SDO_RX,
+        sdo.sdo_download_request(0x1600, 1, codec.U32.pack(codec.RPDO1_MAP[0])),
+    ),
+    ("581#6060600000000000", SDO_TX, sdo.sdo_download_response(0x6060, 0)),
+    ("601#4041600000000000", SDO_RX, sdo.sdo_upload_request(0x6041, 0)),
+    ("581#4B41600037120000", SDO_TX, sdo.sdo_upload_response(0x6041, 0, b"\x37\x12")),
+    ("581#4F6160000A000000", SDO_TX, sdo.sdo_upload_response(0x6061, 0, b"\x0a")),
+    ("581#4300100092010200", SDO_TX, sdo.sdo_upload_response(0x1000, 0, codec.U32.pack(0x20192))),
     # segmented upload of "hil emulated drive": 18 bytes announced, 7 + 7 + 4
-    ("581#4108100012000000", codec.COB_SDO_TX + NODE, sdo.sdo_upload_response(0x1008, 0, b"hil emulated drive")),
-    ("601#6000000000000000", codec.COB_SDO_RX + NODE, sdo.sdo_upload_segment_request(0)),
-    ("581#0068696C20656D75", codec.COB_SDO_TX + NODE, sdo.sdo_upload_segment_response(0, b"hil emu", is_last=False)),
-    ("601#7000000000000000", codec.COB_SDO_RX + NODE, sdo.sdo_upload_segment_request(1)),
-    ("581#106C617465642064", codec.COB_SDO_TX + NODE, sdo.sdo_upload_segment_response(1, b"lated d", is_last=False)),
-    ("581#0772697665000000", codec.COB_SDO_TX + NODE, sdo.sdo_upload_segment_response(0, b"rive", is_last=True)),
+    ("581#4108100012000000", SDO_TX, sdo.sdo_upload_response(0x1008, 0, b"hil emulated drive")),
+    ("601#6000000000000000", SDO_RX, sdo.sdo_upload_segment_request(0)),
+    ("581#0068696C20656D75", SDO_TX, sdo.sdo_upload_segment_response(0, b"hil emu", is_last=False)),
+    ("601#7000000000000000", SDO_RX, sdo.sdo_upload_segment_request(1)),
+    ("581#106C617465642064", SDO_TX, sdo.sdo_upload_segment_response(1, b"lated d", is_last=False)),
+    ("581#0772697665000000", SDO_TX, sdo.sdo_upload_segment_response(0, b"rive", is_last=True)),
     # segmented download of 9 bytes, 7 + 2
-    ("601#2101200009000000", codec.COB_SDO_RX + NODE, sdo.sdo_download_request(0x2001, 0, b"123456789")),
-    ("601#0031323334353637", codec.COB_SDO_RX + NODE, sdo.sdo_download_segment_request(0, b"1234567", is_last=False)),
-    ("581#2000000000000000", codec.COB_SDO_TX + NODE, sdo.sdo_download_segment_response(0)),
-    ("601#1B38390000000000", codec.COB_SDO_RX + NODE, sdo.sdo_download_segment_request(1, b"89", is_last=True)),
-    ("581#3000000000000000", codec.COB_SDO_TX + NODE, sdo.sdo_download_segment_response(1)),
-    ("581#8060600030000906", codec.COB_SDO_TX + NODE, sdo.sdo_abort(0x6060, 0, SdoAbort.VALUE_RANGE)),
-]  # fmt: skip
+    ("601#2101200009000000", SDO_RX, sdo.sdo_download_request(0x2001, 0, b"123456789")),
+    (
+        "601#0031323334353637",
+        SDO_RX,
+        sdo.sdo_download_segment_request(0, b"1234567", is_last=False),
+    ),
+    ("581#2000000000000000", SDO_TX, sdo.sdo_download_segment_response(0)),
+    ("601#1B38390000000000", SDO_RX, sdo.sdo_download_segment_request(1, b"89", is_last=True)),
+    ("581#3000000000000000", SDO_TX, sdo.sdo_download_segment_response(1)),
+    ("581#8060600030000906", SDO_TX, sdo.sdo_abort(0x6060, 0, SdoAbort.VALUE_RANGE)),
+]
 
 
-@pytest.mark.parametrize(
-    ("notation", "can_id", "data"), GOLDEN_FRAMES, ids=lambda value: str(value)
-)
+@pytest.mark.parametrize(("notation", "can_id", "data"), GOLDEN_FRAMES, ids=str)
 def test_codec__packed__equals_golden_frame(notation, can_id, data):
     identifier, _, payload = notation.partition("#")
     assert pack_frame(can_id, data) == pack_frame(int(identifier, 16), bytes.fromhex(payload))

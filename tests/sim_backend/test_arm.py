@@ -9,13 +9,12 @@ from pathlib import Path
 
 import pytest
 
-import sim_backend
 from sim_backend.arm import Arm
 from sim_backend.errors import PlantError, SimError
 from sim_backend.presets import plant_preset
 from sim_backend.settings import LinkSettings, PlantSettings
 
-ROOT = Path(sim_backend.__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def bench(**changes: object) -> PlantSettings:

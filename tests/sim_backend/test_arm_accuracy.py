@@ -51,9 +51,7 @@ def test_arm__substep_halved__error_falls_to_a_quarter(name):
 
 
 def test_naive_arm__substep_halved__error_falls_by_half_only():
-    coarse, fine = (
-        measure("fast start", dt, wrong_arms.Naive).q_first_second_rad for dt in (250e-6, 125e-6)
-    )
+    coarse, fine = (measure("fast start", dt, wrong_arms.Naive).q_rad for dt in (250e-6, 125e-6))
     assert 1.7 < coarse / fine < 2.4
 
 

@@ -4,6 +4,7 @@ import stat
 import tempfile
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from drivers.bus import open_bus
 from drivers.buses.loopback import LoopbackBus
 from drivers.buses.unix import UnixBus
-from drivers.errors import BusAddressError, BusError
+from drivers.errors import BusError
 from drivers.frame import pack_frame, unpack_frame
 from sim_backend.errors import SimError
 from sim_backend.hub import BusWire, UnixHub, open_wire
@@ -235,10 +236,11 @@ def test_hub__another_listens__is_refused_and_the_other_unharmed(hub, path):
 
 
 def test_hub__another_listens_and_is_busy__is_refused(hub, path):
-    waiting = []
-    with pytest.raises(BusError, match="no bus at"):
-        while True:
+    waiting: list[UnixBus] = []
+    with suppress(BusError):
+        while len(waiting) < 100:
             waiting.append(UnixBus(path))
+    assert len(waiting) < 100, "the queue of newcomers never filled"
     with pytest.raises(SimError, match="another emulator already listens"):
         UnixHub(path)
     for client in waiting:
@@ -306,7 +308,7 @@ def test_open_wire__each_scheme__gives_its_wire(path):
         assert isinstance(wire, UnixHub)
     with open_wire("python-can:virtual:open-wire") as wire:
         assert isinstance(wire, BusWire)
-    with pytest.raises(BusAddressError):
+    with pytest.raises(SimError, match="not one of: unix:PATH"):
         open_wire("nonsense:")
     with pytest.raises(SimError, match="no bus python-can:nosuch"):
         open_wire("python-can:nosuch:0")

@@ -1,0 +1,45 @@
+"""Zenoh sessions, opened from settings. Use them in `with` blocks: an open one blocks exit."""
+
+import json
+from collections.abc import Sequence
+
+import zenoh
+
+from hil.config import ZenohSettings
+from hil.errors import HilError
+
+CONNECT_TIMEOUT_MS = 3000
+
+
+class SessionError(HilError):
+    """A Zenoh session could not be opened."""
+
+
+def open_session(settings: ZenohSettings) -> zenoh.Session:
+    """Open a session that listens and connects as configured.
+
+    Raises:
+        SessionError: If an endpoint is in use, malformed or cannot be reached; one line.
+    """
+    zenoh_config = zenoh.Config()
+    values: dict[str, object] = {
+        "mode": settings.mode,
+        "listen/endpoints": list(settings.listen),
+        "connect/endpoints": list(settings.connect),
+        "connect/timeout_ms": CONNECT_TIMEOUT_MS,
+        "connect/exit_on_failure": True,
+        "scouting/multicast/enabled": settings.multicast_scouting,
+    }
+    try:
+        for key, value in values.items():
+            zenoh_config.insert_json5(key, json.dumps(value))
+        return zenoh.open(zenoh_config)
+    except zenoh.ZError as error:
+        endpoints = ", ".join([*settings.listen, *settings.connect])
+        reason = str(error).split(" at /")[0].rstrip(" [")
+        raise SessionError(f"Zenoh session ({endpoints}): {reason}") from error
+
+
+def client_settings(endpoints: Sequence[str]) -> ZenohSettings:
+    """Settings of a client that connects to a daemon (or router) at `endpoints`."""
+    return ZenohSettings(mode="client", listen=(), connect=tuple(endpoints))

@@ -1,0 +1,236 @@
+"""Closed-form closed loop, written apart from the product: 2-link dynamics, RK4, the paper's law.
+
+Its runs validate metrics, bounds, recordings and reports without the loop they are made for.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from hil.scenarios import KellyTrajectory, Scenario, VelocitySource, find_scenario
+from hil.telemetry import SampleLayout
+
+PERIOD_S = 1e-3
+SUBSTEP_S = 500e-6
+SUBSTEPS = 2
+TANH_SLOPE_S_RAD = 50.0
+ACTIVE = 3
+LAYOUT = SampleLayout(2, with_truth=True)
+
+
+@dataclass(frozen=True)
+class Arm:
+    length_m: tuple[float, float]
+    com_m: tuple[float, float]
+    mass_kg: tuple[float, float]
+    inertia_kg_m2: tuple[float, float]
+    viscous_Nms_rad: tuple[float, float]
+    coulomb_Nm: tuple[float, float]
+    tau_max_Nm: tuple[float, float]
+
+
+BENCH = Arm(
+    (0.25, 0.25), (0.1, 0.1), (2.0, 0.8), (0.030, 0.032), (0.05, 0.01), (0.05, 0.01), (15.0, 8.0)
+)
+PELICAN = Arm(
+    (0.26, 0.26),
+    (0.0983, 0.0229),
+    (6.5225, 2.0458),
+    (0.1213, 0.0116),
+    (0.10, 0.01),
+    (0.20, 0.02),
+    (25.0, 5.0),
+)
+ARMS = {"bench": BENCH, "pelican": PELICAN}
+
+
+@dataclass(frozen=True)
+class Law:
+    """tau = -Kd S with the paper's gains; a wrong one is made with `replace`."""
+
+    alpha: tuple[float, float] = (5.0, 7.5)
+    lambda_: float = 10.0
+    Ki: float = 0.2
+    beta: tuple[float, float, float] = (1.0, 2.0, 4.0)  # big, medium, small
+    learning_rate: float = 1e-6
+
+
+def make_acceleration(arm: Arm, gravity_m_s2: float) -> Callable[..., tuple[float, float]]:
+    """Accelerations of (1); q1 from the downward vertical, q2 relative."""
+    l1, (c1, c2), (m1, m2), (i1, i2) = arm.length_m[0], arm.com_m, arm.mass_kg, arm.inertia_kg_m2
+    (b1, b2), (f1, f2) = arm.viscous_Nms_rad, arm.coulomb_Nm
+    h22 = i2 + m2 * c2 * c2
+    coupling = m2 * l1 * c2
+    straight = i1 + m1 * c1 * c1 + m2 * l1 * l1 + h22
+    g1, g2 = (m1 * c1 + m2 * l1) * gravity_m_s2, m2 * c2 * gravity_m_s2
+    sin, cos, tanh, D = math.sin, math.cos, math.tanh, TANH_SLOPE_S_RAD
+
+    def acceleration(q1, q2, v1, v2, t1, t2):
+        k, s = coupling * cos(q2), coupling * sin(q2)
+        h11, h12, outer = straight + 2 * k, h22 + k, g2 * sin(q1 + q2)
+        centrifugal = s * v2 * (2 * v1 + v2)
+        r1 = t1 - b1 * v1 - f1 * tanh(D * v1) + centrifugal - g1 * sin(q1) - outer
+        r2 = t2 - b2 * v2 - f2 * tanh(D * v2) - s * v1 * v1 - outer
+        det = h11 * h22 - h12 * h12
+        return (h22 * r1 - h12 * r2) / det, (h11 * r2 - h12 * r1) / det
+
+    return acceleration
+
+
+def rk4(f, state, torques, h):
+    """One step; `torques` are those at its start, middle and end."""
+    q1, q2, v1, v2 = state
+    half = h / 2
+    a1, a2 = f(q1, q2, v1, v2, *torques[0])
+    u1, u2 = v1 + half * a1, v2 + half * a2
+    b1, b2 = f(q1 + half * v1, q2 + half * v2, u1, u2, *torques[1])
+    w1, w2 = v1 + half * b1, v2 + half * b2
+    c1, c2 = f(q1 + half * u1, q2 + half * u2, w1, w2, *torques[1])
+    x1, x2 = v1 + h * c1, v2 + h * c2
+    d1, d2 = f(q1 + h * w1, q2 + h * w2, x1, x2, *torques[2])
+    return (
+        q1 + h / 6 * (v1 + 2 * u1 + 2 * w1 + x1),
+        q2 + h / 6 * (v2 + 2 * u2 + 2 * w2 + x2),
+        v1 + h / 6 * (a1 + 2 * b1 + 2 * c1 + d1),
+        v2 + h / 6 * (a2 + 2 * b2 + 2 * c2 + d2),
+    )
+
+
+def memberships(s: float) -> tuple[float, float, float]:
+    a = 1.0 / (1.0 + math.exp(min((0.20 - s) / 0.04, 700.0)))
+    b = 1.0 / (1.0 + math.exp(min((0.60 - s) / 0.12, 700.0)))
+    return b, max(a - b, 0.0), 1.0 - a
+
+
+class FilteredDifference:
+    def __init__(self, q: float, cutoff_Hz: float) -> None:
+        self.q, self.v = q, 0.0
+        self.share = 1 - math.exp(-2 * math.pi * cutoff_Hz * PERIOD_S)
+
+    def step(self, q: float) -> float:
+        self.v += self.share * ((q - self.q) / PERIOD_S - self.v)
+        self.q = q
+        return self.v
+
+
+class Levant:
+    def __init__(self, q: float, C: float) -> None:
+        self.x, self.v, self.k1, self.k2 = q, 0.0, 1.5 * math.sqrt(C), 1.1 * C
+
+    def step(self, q: float) -> float:
+        error = self.x - q
+        sign = (error > 0) - (error < 0)
+        self.x += PERIOD_S * (self.v - self.k1 * math.sqrt(abs(error)) * sign)
+        self.v -= PERIOD_S * self.k2 * sign
+        return self.v
+
+
+def make_estimators(velocity: VelocitySource, q) -> list[FilteredDifference | Levant] | None:
+    if velocity.kind == "levant":
+        return [Levant(x, C) for x, C in zip(q, velocity.levant_C_rad_s2, strict=True)]
+    if velocity.kind == "filtered_difference":
+        return [FilteredDifference(x, velocity.cutoff_Hz) for x in q]
+    return None
+
+
+def reference(trajectory: KellyTrajectory, t_s: float) -> tuple[list[float], list[float]]:
+    r, s = trajectory.rate, trajectory.rate * t_s
+    h, dh = 1 - math.exp(-2 * s**3), 6 * s * s * math.exp(-2 * s**3)
+    q, dq = [], []
+    for b, c, w in zip(trajectory.b_rad, trajectory.c_rad, trajectory.w_rad_s, strict=True):
+        sine, cosine = math.sin(w * s), math.cos(w * s)
+        q.append(h * (b + c * sine))
+        dq.append(r * (dh * (b + c * sine) + h * c * w * cosine))
+    return q, dq
+
+
+class Controller:
+    def __init__(self, scenario: Scenario, law: Law) -> None:
+        self.law = law
+        self.tau_max = ARMS[scenario.preset.split("_")[0]].tau_max_Nm
+        self.rate = 0.0 if scenario.adaptation == "off" else law.learning_rate
+        self.beta = [list(law.beta), list(law.beta)]
+        self.sigma = [0.0, 0.0]
+
+    def step(self, q, dq, q_des, dq_des):
+        """S, Kd, requested and sent torque per joint; sigma moves on after use."""
+        law, rows = self.law, []
+        for j in (0, 1):
+            S_q = dq[j] - dq_des[j] + law.alpha[j] * (q[j] - q_des[j])
+            S = S_q + law.Ki * self.sigma[j]
+            mu = memberships(abs(S))
+            Kd = min(max(sum(b * m for b, m in zip(self.beta[j], mu, strict=True)), 1.0), 4.0)
+            sent = min(max(-Kd * S, -self.tau_max[j]), self.tau_max[j])
+            if sent == -Kd * S or S_q * S < 0:
+                self.sigma[j] += PERIOD_S * math.tanh(law.lambda_ * S_q)
+            for i, m in enumerate(mu):
+                step = self.rate * S * law.alpha[j] * m
+                self.beta[j][i] = min(max(self.beta[j][i] - step, 1.0), 4.0)
+            rows.append((S, Kd, -Kd * S, sent))
+        return [list(column) for column in zip(*rows, strict=True)]
+
+
+def run(scenario: Scenario, law: Law | None = None, duration_s: float | None = None):
+    """Samples of one run as the loop would report them, one row a cycle."""
+    arm, gravity = ARMS[scenario.preset.split("_")[0]], scenario.preset.endswith("_v")
+    acceleration = make_acceleration(arm, 9.81 if gravity else 0.0)
+    count = 2 * math.pi / 2**scenario.encoder_bits if scenario.encoder_bits else 0.0
+    controller = Controller(scenario, law or Law())
+    state = (*scenario.q0_rad, 0.0, 0.0)
+
+    def read(q: float) -> float:
+        return round(q / count) * count if count else q
+
+    estimators = make_estimators(scenario.velocity, [read(q) for q in scenario.q0_rad])
+    half = math.exp(-SUBSTEP_S / 2 / scenario.torque_lag_s)
+    waiting = [(0.0, 0.0)] * round(scenario.torque_delay_s / SUBSTEP_S)
+    torque, log = (0.0, 0.0), []
+    for k in range(round((duration_s or scenario.duration_s) / PERIOD_S)):
+        q_des, dq_des = reference(scenario.trajectory, k * PERIOD_S)
+        q_true, dq_true = state[:2], state[2:]
+        q = [read(x) for x in q_true]
+        dq = [e.step(x) for e, x in zip(estimators, q, strict=True)] if estimators else dq_true
+        sigma = list(controller.sigma)
+        S, Kd, cmd, sent = controller.step(q, dq, q_des, dq_des)
+        mean = [0.0, 0.0]
+        for _ in range(SUBSTEPS):
+            waiting.append(tuple(sent))
+            goal = waiting.pop(0)
+            mid = tuple(g + (t - g) * half for g, t in zip(goal, torque, strict=True))
+            end = tuple(g + (t - g) * half for g, t in zip(goal, mid, strict=True))
+            state = rk4(acceleration, state, (torque, mid, end), SUBSTEP_S)
+            for j in (0, 1):
+                mean[j] += (torque[j] + 4 * mid[j] + end[j]) / 6 / SUBSTEPS
+            torque = end
+        stamps = (0, 0, ACTIVE, 0, 0, 0, 60_000 + k % 97 * 500, 350_000, 390_000, 400_000, 110_000)
+        head = (k, k, k * 1_000_000, *stamps[2:], k * PERIOD_S)
+        box = ([1.0, 1.0], [4.0, 4.0])
+        motion = (q, dq, q_des, dq_des, S, sigma, Kd, *box, cmd, sent, list(torque))
+        log.append((*head, *motion, q_true, dq_true, mean))
+    return np.array(log, dtype=LAYOUT.dtype)
+
+
+@cache
+def run_named(name: str):
+    """The run of a reference scenario, made once per test session; do not write to it."""
+    rows = run(find_scenario(name))
+    rows.flags.writeable = False
+    return rows
+
+
+def shortened(name: str, duration_s: float) -> Scenario:
+    """A scenario cut short, statistics over its second half."""
+    return replace(find_scenario(name), duration_s=duration_s, stat_start_s=duration_s / 2)
+
+
+def payloads(rows) -> list[bytes]:
+    """Serialise samples as the loop does."""
+    write, buffer = LAYOUT.writer(), bytearray(LAYOUT.size)
+    split, out = len(LAYOUT.scalar_names), []
+    for row in rows.tolist():
+        write(buffer, 0, row[:split], row[split:])
+        out.append(bytes(buffer))
+    return out
