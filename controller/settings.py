@@ -23,7 +23,9 @@ def _require_lengths(settings: BaseModel, names: Iterable[str], joints: int) -> 
 class VelocitySettings(_Settings):
     """How joint velocity is estimated from the encoder."""
 
-    estimator: Literal["filtered_difference", "levant"] = "filtered_difference"
+    estimator: Literal["filtered_difference", "levant", "amplifier"] = Field(
+        "filtered_difference", description="amplifier: take the rate the amplifier reports"
+    )
     cutoff_Hz: float = Field(30.0, gt=0, description="of the filtered difference")
     C_rad_s2: Joints = Field(
         (50.0, 100.0),
@@ -108,8 +110,6 @@ class ControllerSettings(_Settings):
         if self.velocity.estimator == "levant":
             _require_lengths(self.velocity, ("C_rad_s2",), joints)
         limits = [
-            name
-            for name, value in LimitSettings.model_fields.items()
-            if value.annotation == Joints
+            name for name, value in LimitSettings.model_fields.items() if value.annotation == Joints
         ]
         _require_lengths(self.limits, limits, joints)

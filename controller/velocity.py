@@ -4,6 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+from controller.errors import ControllerError
 from controller.settings import VelocitySettings
 
 
@@ -94,7 +95,13 @@ class Levant(VelocityEstimator):
 
 
 def make_estimator(settings: VelocitySettings, joints: int) -> VelocityEstimator:
-    """Build the configured estimator for a number of joints."""
+    """Build the configured estimator for a number of joints.
+
+    Raises:
+        ControllerError: For `amplifier`, where nothing is to be estimated.
+    """
+    if settings.estimator == "amplifier":
+        raise ControllerError("the amplifiers report the velocity; there is no estimator")
     if settings.estimator == "levant":
         return Levant(settings, joints)
     return FilteredDifference(joints, settings.cutoff_Hz)

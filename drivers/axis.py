@@ -55,6 +55,7 @@ class Axis(ABC):
     Attributes:
         label: How messages name the axis, e.g. `joint 1 (cia402 node 1)`.
         q_rad: Joint angle of the last fresh feedback.
+        dq_rad_s: Joint rate the amplifier reported with it; None if the family reports none.
         tau_meas_Nm: Joint torque the amplifier reported with it.
         age_cycles: Cycles since that feedback; 0 = fresh.
         status: What the amplifier says of itself.
@@ -67,6 +68,7 @@ class Axis(ABC):
     def __init__(self, label: str) -> None:
         self.label = label
         self.q_rad = 0.0
+        self.dq_rad_s: float | None = None
         self.tau_meas_Nm = 0.0
         self.age_cycles = 1
         self.status = AxisStatus.DISABLED

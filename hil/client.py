@@ -125,7 +125,7 @@ class Client:
 
     def close(self) -> None:
         """End the session. Idempotent."""
-        self._session.close()
+        self._session.close()  # type: ignore[no-untyped-call] # untyped in zenoh's stubs
 
     def __enter__(self) -> Self:
         return self

@@ -5,7 +5,7 @@ are given to it. Nothing in here waits except for feedback, and that until a dea
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from controller.errors import CommandError
 from controller.faults import FaultCode, Reaction
@@ -13,17 +13,47 @@ from controller.law import PassivityLaw
 from controller.limits import MotionGuard, TorqueLimiter
 from controller.machine import Machine, State, Trigger
 from controller.player import ReferencePlayer, Setpoint
-from controller.velocity import make_estimator
-from drivers.arm_bus import ArmBus
-from drivers.axis import AxisStatus
+from controller.velocity import VelocityEstimator, make_estimator
+from drivers.axis import Axis, AxisStatus
 from drivers.errors import BusError
-from hil.config import Config
+from hil.config import Config, ConfigError
 
 AT_REST_RAD_S = 0.05
 """A damped stop ends when every joint is slower than this."""
 
 EventSink = Callable[[str, Mapping[str, Any]], None]
 """Takes an event's kind and its details."""
+
+
+class ArmLink(Protocol):
+    """The amplifiers of one arm as the cycle sees them; `drivers.arm_bus.ArmBus` says more."""
+
+    @property
+    def axes(self) -> Sequence[Axis]:
+        """Shoulder first."""
+
+    @property
+    def is_enabled(self) -> bool:
+        """Every axis applies torque."""
+
+    @property
+    def age_cycles(self) -> int:
+        """Age of the oldest feedback, 0 = all fresh."""
+
+    def request_feedback(self) -> None:
+        """Begin a cycle."""
+
+    def collect(self, deadline_ns: int) -> bool:
+        """Wait for feedback; True if all of it is fresh."""
+
+    def send_torques(self, tau_Nm: Sequence[float]) -> None:
+        """End a cycle."""
+
+    def inject_fault(self, joint: int) -> bool:
+        """Put an emulated amplifier into fault."""
+
+    def first_in(self, status: AxisStatus) -> Axis | None:
+        """Return the first axis with this status."""
 
 
 class Control:
@@ -42,7 +72,7 @@ class Control:
     """
 
     def __init__(
-        self, config: Config, bus: ArmBus, *, now_ns: Callable[[], int], events: EventSink
+        self, config: Config, bus: ArmLink, *, now_ns: Callable[[], int], events: EventSink
     ) -> None:
         settings, n = config.controller, config.joints
         self.machine = Machine()
@@ -61,7 +91,7 @@ class Control:
         self._limits = settings.limits
         self._limiter = TorqueLimiter(settings.limits)
         self._guard = MotionGuard(settings.limits)
-        self._estimator = make_estimator(settings.velocity, n)
+        self._estimator = _make_estimator(config, bus)
         self._zeros = [0.0] * n
         self._enable_cycles = round(config.loop.enable_timeout_s / self._period_s)
         self._stop_cycles = round(settings.limits.stop_timeout_s / self._period_s)
@@ -104,7 +134,9 @@ class Control:
             return
         self._age = 0
         q = [axis.q_rad for axis in self._bus.axes]
-        if self._has_feedback:
+        if self._estimator is None:
+            self.dq_rad_s = [axis.dq_rad_s or 0.0 for axis in self._bus.axes]
+        elif self._has_feedback:
             self.dq_rad_s = self._estimator.step(q, self._dt_s)
         else:
             self._estimator.reset(q)
@@ -152,7 +184,7 @@ class Control:
             return self._rest()
 
     def _violation(self, setpoint: Setpoint) -> FaultCode:
-        if not self._estimator.is_locked:
+        if self._estimator is not None and not self._estimator.is_locked:
             return FaultCode.ESTIMATOR_LOST
         return self._guard.check(self.q_rad, self.dq_rad_s, setpoint.q_rad)
 
@@ -327,3 +359,21 @@ class Control:
         """Put the emulated amplifier of a joint (from 1) into fault."""
         if not self._bus.inject_fault(joint - 1):
             raise CommandError(f"the amplifier of joint {joint} has no fault injection")
+
+
+def _make_estimator(config: Config, bus: ArmLink) -> VelocityEstimator | None:
+    """Build the configured estimator; None where the amplifiers report the velocity.
+
+    Raises:
+        ConfigError: If they are to and one of them does not.
+    """
+    settings = config.controller.velocity
+    if settings.estimator != "amplifier":
+        return make_estimator(settings, config.joints)
+    silent = next((axis for axis in bus.axes if axis.dq_rad_s is None), None)
+    if silent is not None:
+        raise ConfigError(
+            f"controller.velocity.estimator 'amplifier': {silent.label} reports no velocity; use "
+            "filtered_difference"
+        )
+    return None

@@ -23,10 +23,9 @@ def has_truth(rows: Records) -> bool:
 def decay_rates(rows: Records) -> Array:
     """Return ln 10 / (first time |S| < 10 % of |S(0)|) per joint, with S free of encoder noise.
 
-    In simulation S is built from the plant's own position and rate; otherwise from the encoder's
-    position smoothed without lag. Either way alpha and Ki are those the recorded S was made with.
+    NaN if S starts at zero (no initial error) or never decays.
     """
-    S = np.abs(_noise_free_manifold(rows))
+    S = np.abs(noise_free_manifold(rows))
     t_s = rows["t_ref_s"]
     rates = np.full(S.shape[1], np.nan)
     for joint, column in enumerate(S.T):
@@ -36,21 +35,31 @@ def decay_rates(rows: Records) -> Array:
     return rates
 
 
-def _noise_free_manifold(rows: Records) -> Array:
+def noise_free_manifold(rows: Records) -> Array:
+    """Return S without encoder noise: from the plant's own motion, else from the encoder smoothed.
+
+    alpha and Ki are those with which the recorded S was made.
+    """
     if has_truth(rows):
         q, dq = rows["q_true_rad"], rows["dq_true_rad_s"]
     else:
         q, dq = smoothed_motion(rows["t_ref_s"], rows["q_meas_rad"])
-    S = np.array(rows["S_rad_s"], dtype=np.float64)
-    for joint in range(S.shape[1]):
-        error = rows["q_meas_rad"][:, joint] - rows["q_des_rad"][:, joint]
-        rate_error = rows["dq_meas_rad_s"][:, joint] - rows["dq_des_rad_s"][:, joint]
-        # S = dq_err + alpha q_err + Ki sigma, paper (6), (7): exact, so two gains are found exactly
-        terms = np.column_stack((error, rows["sigma"][:, joint]))
-        alpha = np.linalg.lstsq(terms, S[:, joint] - rate_error)[0][0]
-        S[:, joint] += dq[:, joint] - rows["dq_meas_rad_s"][:, joint]
-        S[:, joint] += alpha * (q[:, joint] - rows["q_meas_rad"][:, joint])
-    return S
+    measured_q, measured_dq = rows["q_meas_rad"], rows["dq_meas_rad_s"]
+    alpha = _position_gains(rows)
+    return np.asarray(rows["S_rad_s"] + (dq - measured_dq) + alpha * (q - measured_q))
+
+
+def _position_gains(rows: Records) -> Array:
+    """Return alpha per joint: S = dq_err + alpha q_err + Ki sigma, paper (6), (7), is exact."""
+    error = rows["q_meas_rad"] - rows["q_des_rad"]
+    rest = rows["S_rad_s"] - (rows["dq_meas_rad_s"] - rows["dq_des_rad_s"])
+    alpha = np.full(error.shape[1], np.nan)
+    for joint in range(error.shape[1]):
+        terms = np.column_stack((error[:, joint], rows["sigma"][:, joint], rest[:, joint]))
+        terms = terms[np.isfinite(terms).all(axis=1)]
+        if len(terms):
+            alpha[joint] = np.linalg.lstsq(terms[:, :2], terms[:, 2])[0][0]
+    return alpha
 
 
 def smoothed_motion(t_s: Array, q_rad: Array) -> tuple[Array, Array]:

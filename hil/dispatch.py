@@ -59,20 +59,6 @@ class _OutcomeTimeoutError(HilError):
     """The loop did not say in time what became of a command."""
 
 
-def motion_limits(config: Config) -> MotionLimits:
-    """Limits that every trajectory is checked against."""
-    limits = config.controller.limits
-    return MotionLimits(
-        q_min_rad=limits.q_min_rad,
-        q_max_rad=limits.q_max_rad,
-        dq_max_rad_s=limits.dq_max_rad_s,
-        ddq_max_rad_s2=limits.ddq_max_rad_s2,
-        dddq_max_rad_s3=limits.dddq_max_rad_s3,
-        following_error_rad=limits.following_error_rad,
-        max_duration_s=config.trajectory.max_duration_s,
-    )
-
-
 def check_gain_bounds(request: GainBoundsRequest, config: Config) -> None:
     """Refuse gain bounds for the wrong number of joints, or outside floor and ceiling.
 
@@ -102,7 +88,9 @@ class Dispatcher:
         self.present = Present()
         self._shared = shared
         self._config = shared.config
-        self._limits = motion_limits(shared.config)
+        self._limits = MotionLimits.of(
+            shared.config.controller.limits, shared.config.trajectory.max_duration_s
+        )
         self._patience_s = {
             "enable": shared.config.loop.enable_timeout_s + OUTCOME_TIMEOUT_S,
             "disable": shared.config.controller.limits.stop_timeout_s + OUTCOME_TIMEOUT_S,

@@ -249,6 +249,16 @@ def parse(command: str, payload: bytes | str) -> Request:
     return request
 
 
+def parse_trajectory(payload: bytes | str) -> TrajectoryRequest:
+    """Read the payload of `cmd/trajectory`.
+
+    Raises:
+        RequestError: As for `parse`.
+    """
+    request: TrajectoryRequest = parse("trajectory", payload)  # type: ignore[assignment] # by its adapter
+    return request
+
+
 def explain(error: ValidationError) -> str:
     """Say in one line where a message is wrong, what is wrong, and what stood there."""
     first = error.errors(include_url=False, include_context=False)[0]

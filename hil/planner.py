@@ -41,6 +41,8 @@ _CurveRequest = (
 )
 _MARGIN = 1.0 - 1e-6  # ruckig runs along its limits, give or take its rounding
 
+_NO_MOVE = "no move to this target can be computed from the present motion; stop first"
+
 
 class Refusal(HilError):  # noqa: N818 - an answer rather than an error
     """A well-formed request that the arm cannot follow. Nothing has changed.
@@ -205,6 +207,18 @@ def _plan_move(
 ) -> Reference:
     _require_joints("the target", len(request.target_rad), limits)
     _require_target(request.target_rad, limits)
+    if request.speed_scale == 1.0 or state.is_at_rest:
+        return _move(request, state, limits, period_s)
+    with _refusing("braking before the move: "):  # slowed limits are none for a fast start
+        stop = trajectory.brake(state, limits.admitting(state.q_rad), period_s)
+    whole = concatenate([stop, _move(request, stop.end, limits, period_s)])
+    _require_duration("the move with its braking", whole.duration_s, limits)
+    return whole
+
+
+def _move(
+    request: MoveRequest, state: MotionState, limits: MotionLimits, period_s: float
+) -> Reference:
     profile = _move_profile(request, state, limits)
     _require_duration("the move", profile.duration, limits)
     periods = max(1, ceil(profile.duration / period_s - 1e-6))
@@ -232,10 +246,10 @@ def _move_profile(
     profile = ruckig.Trajectory(limits.joints)
     try:
         result = ruckig.Ruckig(limits.joints).calculate(wanted, profile)
-    except ruckig.RuckigError as error:
-        raise Refusal("no move to this target can be computed") from error
+    except (ruckig.RuckigError, ValueError) as error:  # ValueError: a result its enum does not know
+        raise Refusal(_NO_MOVE) from error
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):
-        raise Refusal("no move to this target can be computed from the present motion; stop first")
+        raise Refusal(_NO_MOVE)
     return profile
 
 

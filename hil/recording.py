@@ -9,6 +9,7 @@ host, no version), so that the same run written twice gives the same bytes.
 import json
 import struct
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -32,6 +33,7 @@ from hil.telemetry import BusFrameLayout, LoggedFrame, SampleLayout, TelemetryEr
 FLUSH_PERIOD_NS: Final = 100_000_000
 """Recorded time after which a chunk is closed and handed to the kernel: what a kill can cost."""
 _CONFIG: Final = "config"
+_MOST_JOINTS: Final = 255  # more is a damaged file
 _BLOCK: Final = 4096  # samples decoded at a time
 _DAMAGE: Final = (McapError, ZstdError, struct.error, ValueError, RuntimeError, MemoryError)
 """What mcap's reader and its decompressors raise on a cut or damaged file."""
@@ -72,7 +74,13 @@ class RecordingWriter:
         self._telemetry = self._channel("telemetry", telemetry_pb2.Sample)
         self._bus = self._channel("bus", telemetry_pb2.BusLog)
         self._event = self._channel("event", telemetry_pb2.Event)
-        self.flush()
+        try:
+            self.flush()
+        except RecordingError:
+            self._is_closed = True
+            with suppress(OSError):  # closing tries to write once more
+                self._file.close()
+            raise
 
     def _channel(self, topic: str, message: Any) -> int:  # noqa: ANN401 - generated class
         files = FileDescriptorSet()
@@ -288,9 +296,10 @@ class _Reader:
     def layout(self) -> SampleLayout:
         """Return the samples' layout, known once the metadata has passed."""
         try:
-            return SampleLayout(
-                int(self.metadata["joints"]), json.loads(self.metadata["with_truth"]) is True
-            )
+            joints = int(self.metadata["joints"])
+            if joints > _MOST_JOINTS:
+                raise ValueError(f"{joints} joints")
+            return SampleLayout(joints, json.loads(self.metadata["with_truth"]) is True)
         except (KeyError, ValueError) as error:
             raise RecordingError(
                 f"{self.path} is MCAP but not a recording of this program (no {_CONFIG} metadata)"

@@ -3,8 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from drivers.arm_bus import ArmBus
-from hil.control import Control
+from hil.control import ArmLink, Control
 from hil.telemetry import Buffer, SampleLayout
 
 Truth = Callable[[], tuple[Sequence[float], Sequence[float], Sequence[float]]]
@@ -26,7 +25,7 @@ class Sampler:
     """Serialises the samples of one run, numbered without gaps."""
 
     def __init__(
-        self, layout: SampleLayout, control: Control, bus: ArmBus, truth: Truth | None = None
+        self, layout: SampleLayout, control: Control, bus: ArmLink, truth: Truth | None = None
     ) -> None:
         self.seq = 0
         self._write = layout.writer()

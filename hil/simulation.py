@@ -13,13 +13,16 @@ from drivers.arm_bus import ArmBus
 from drivers.buses.loopback import LoopbackBus
 from drivers.registry import make_axes
 from hil.config import Config
-from hil.control import Control
+from hil.control import ArmLink, Control
 from hil.emulation import build_emulator
 from hil.errors import HilError
 from hil.executor import Executor
+from hil.ideal import IdealArm
 from hil.recording import RecordingWriter
 from hil.sampler import Sampler, Stamps
 from hil.telemetry import BusFrameLayout, SampleLayout
+from sim_backend.arm import Arm
+from sim_backend.emulator import Emulator
 
 NO_STAMPS = Stamps()
 """Virtual time stands still within a cycle."""
@@ -51,27 +54,36 @@ class Simulation:
         self._write_frame = self._frame_layout.writer()
         self._log = bytearray()
         self._log_ns = 0
-        loopback = LoopbackBus()
-        self._emulator = build_emulator(config, loopback.deliver, is_lockstep=True)
-        loopback.connect(self._emulator.receive, self._wait)
-        axes = make_axes(config.axes, period_s=config.loop.period_s)
-        self._bus = ArmBus(loopback, axes, now_ns=lambda: self._clock_ns)
-        self.control = Control(config, self._bus, now_ns=lambda: self._clock_ns, events=self._emit)
+        self._emulator: Emulator | None = None
+        self._plant: Emulator | IdealArm
+        link: ArmLink
+        self._plant, link = self._build_ideal() if config.emulator.is_ideal else self._build()
+        self.control = Control(config, link, now_ns=lambda: self._clock_ns, events=self._emit)
         self._rows: dict[int, Sequence[float]] = {}
         self._executor = Executor(self.control, self._rows.__getitem__, self._report_outcome)
         layout = SampleLayout(config.joints, with_truth=True)
-        self._sampler = Sampler(layout, self.control, self._bus, self._truth)
+        self._sampler = Sampler(layout, self.control, link, self._truth)
         self._sample = bytearray(layout.size)
-        self._start()
-
-    def _start(self) -> None:
-        if self._recording is not None:
-            self._bus.log_frames(self._log_frame)
-        self._emulator.power_on()
-        heartbeat_s = min(axis.heartbeat_ms for axis in self.config.axes) * 1e-3
-        self._bus.configure(heartbeat_cycles=round(heartbeat_s / self.config.loop.period_s))
         self.control.fire(Trigger.BUS_READY)
         self._is_starting = False
+
+    def _build(self) -> tuple[Emulator, ArmBus]:
+        """The emulated robot and the drivers in front of it, joined by an in-process bus."""
+        config, loopback = self.config, LoopbackBus()
+        emulator = self._emulator = build_emulator(config, loopback.deliver, is_lockstep=True)
+        loopback.connect(emulator.receive, self._wait)
+        axes = make_axes(config.axes, period_s=config.loop.period_s)
+        bus = ArmBus(loopback, axes, now_ns=lambda: self._clock_ns)
+        if self._recording is not None:
+            bus.log_frames(self._log_frame)
+        emulator.power_on()
+        heartbeat_s = min(axis.heartbeat_ms for axis in config.axes) * 1e-3
+        bus.configure(heartbeat_cycles=round(heartbeat_s / config.loop.period_s))
+        return emulator, bus
+
+    def _build_ideal(self) -> tuple[IdealArm, IdealArm]:
+        link = IdealArm(Arm(self.config.plant), self.config.loop.period_s)
+        return link, link
 
     def step(self) -> None:
         """Run one cycle and record it."""
@@ -132,12 +144,12 @@ class Simulation:
         """Nothing on the bus: virtual time passes, for the plant only before the first cycle."""
         passed_ns = round(timeout_s * 1e9)
         self._clock_ns += passed_ns
-        if self._is_starting:
+        if self._is_starting and self._emulator is not None:
             self._emulator.advance(passed_ns)
 
     def _truth(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        emulator = self._emulator
-        return emulator.q_true_rad, emulator.dq_true_rad_s, emulator.tau_applied_Nm
+        plant = self._plant
+        return plant.q_true_rad, plant.dq_true_rad_s, plant.tau_applied_Nm
 
     def _emit(self, kind: str, detail: Mapping[str, Any]) -> None:
         if self._recording is not None:

@@ -63,3 +63,8 @@ class EmulatorSettings(_Settings):
         gt=0,
         description="lockstep only: without SYNC for this long, time runs by the wall clock",
     )
+    is_ideal: bool = Field(
+        False,
+        description="`hil sim` only: no frames, true position and velocity, torque after 0.5 ms "
+        "delay and 0.5 ms lag",
+    )

@@ -306,6 +306,11 @@ def test_brake__any_state__comes_to_rest_within_limits(start):
     assert_consistent(reference)
 
 
+def test_brake__velocity__falls_along_a_cubic():
+    reference = brake(state([0, 0], [2, -1], [5, 0]), LIMITS, T)
+    assert np.abs(np.diff(reference.dq_rad_s, n=4, axis=0)).max() < 1e-12
+
+
 def test_brake__no_room__is_refused_with_the_position_limit():
     with pytest.raises(LimitError) as e:
         brake(state([2.75, 0.0], [5.0, 0.0], [0.0, 0.0]), LIMITS, T)

@@ -343,8 +343,9 @@ def test_socketcan__reader_too_slow__lost_frames_are_counted(vcan):
         assert bus.stats.frames_received + bus.stats.receive_overflows == 5000
 
 
-def test_socketcan__transmit_queue_full__frame_is_lost_and_counted(slcan_interface):
-    with SocketCanBus(slcan_interface) as bus:
+@pytest.mark.parametrize("scheme", ["socketcan", "python-can:socketcan"])
+def test_socketcan__transmit_queue_full__frame_is_lost_and_counted(slcan_interface, scheme):
+    with open_bus(f"{scheme}:{slcan_interface}") as bus:
         sent = 0
         while bus.send(pack_frame(1, bytes(8))):
             sent += 1

@@ -4,6 +4,7 @@ Its runs validate metrics, bounds, recordings and reports without the loop they 
 """
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -18,6 +19,7 @@ SUBSTEP_S = 500e-6
 SUBSTEPS = 2
 TANH_SLOPE_S_RAD = 50.0
 ACTIVE = 3
+BOX = ((1.0, 1.0), (4.0, 4.0))
 LAYOUT = SampleLayout(2, with_truth=True)
 
 
@@ -161,14 +163,16 @@ class Controller:
         for j in (0, 1):
             S_q = dq[j] - dq_des[j] + law.alpha[j] * (q[j] - q_des[j])
             S = S_q + law.Ki * self.sigma[j]
-            mu = memberships(abs(S))
-            Kd = min(max(sum(b * m for b, m in zip(self.beta[j], mu, strict=True)), 1.0), 4.0)
+            big, medium, small = memberships(abs(S))
+            beta = self.beta[j]
+            Kd = min(max(beta[0] * big + beta[1] * medium + beta[2] * small, 1.0), 4.0)
             sent = min(max(-Kd * S, -self.tau_max[j]), self.tau_max[j])
             if sent == -Kd * S or S_q * S < 0:
                 self.sigma[j] += PERIOD_S * math.tanh(law.lambda_ * S_q)
-            for i, m in enumerate(mu):
-                step = self.rate * S * law.alpha[j] * m
-                self.beta[j][i] = min(max(self.beta[j][i] - step, 1.0), 4.0)
+            if self.rate:
+                step = self.rate * S * law.alpha[j]
+                moved = (beta[0] - step * big, beta[1] - step * medium, beta[2] - step * small)
+                self.beta[j] = [min(max(b, 1.0), 4.0) for b in moved]
             rows.append((S, Kd, -Kd * S, sent))
         return [list(column) for column in zip(*rows, strict=True)]
 
@@ -186,9 +190,11 @@ def run(scenario: Scenario, law: Law | None = None, duration_s: float | None = N
 
     estimators = make_estimators(scenario.velocity, [read(q) for q in scenario.q0_rad])
     half = math.exp(-SUBSTEP_S / 2 / scenario.torque_lag_s)
-    waiting = [(0.0, 0.0)] * round(scenario.torque_delay_s / SUBSTEP_S)
-    torque, log = (0.0, 0.0), []
-    for k in range(round((duration_s or scenario.duration_s) / PERIOD_S)):
+    waiting = deque([(0.0, 0.0)] * round(scenario.torque_delay_s / SUBSTEP_S))
+    cycles = round((duration_s or scenario.duration_s) / PERIOD_S)
+    write, log = LAYOUT.writer(), bytearray(cycles * LAYOUT.size)
+    torque = (0.0, 0.0)
+    for k in range(cycles):
         q_des, dq_des = reference(scenario.trajectory, k * PERIOD_S)
         q_true, dq_true = state[:2], state[2:]
         q = [read(x) for x in q_true]
@@ -197,28 +203,26 @@ def run(scenario: Scenario, law: Law | None = None, duration_s: float | None = N
         S, Kd, cmd, sent = controller.step(q, dq, q_des, dq_des)
         mean = [0.0, 0.0]
         for _ in range(SUBSTEPS):
-            waiting.append(tuple(sent))
-            goal = waiting.pop(0)
-            mid = tuple(g + (t - g) * half for g, t in zip(goal, torque, strict=True))
-            end = tuple(g + (t - g) * half for g, t in zip(goal, mid, strict=True))
+            waiting.append(sent)
+            (g1, g2), (t1, t2) = waiting.popleft(), torque
+            mid = (g1 + (t1 - g1) * half, g2 + (t2 - g2) * half)
+            end = (g1 + (mid[0] - g1) * half, g2 + (mid[1] - g2) * half)
             state = rk4(acceleration, state, (torque, mid, end), SUBSTEP_S)
-            for j in (0, 1):
-                mean[j] += (torque[j] + 4 * mid[j] + end[j]) / 6 / SUBSTEPS
+            mean[0] += (t1 + 4 * mid[0] + end[0]) / 6 / SUBSTEPS
+            mean[1] += (t2 + 4 * mid[1] + end[1]) / 6 / SUBSTEPS
             torque = end
-        stamps = (0, 0, ACTIVE, 0, 0, 0, 60_000 + k % 97 * 500, 350_000, 390_000, 400_000, 110_000)
-        head = (k, k, k * 1_000_000, *stamps[2:], k * PERIOD_S)
-        box = ([1.0, 1.0], [4.0, 4.0])
-        motion = (q, dq, q_des, dq_des, S, sigma, Kd, *box, cmd, sent, list(torque))
-        log.append((*head, *motion, q_true, dq_true, mean))
-    return np.array(log, dtype=LAYOUT.dtype)
+        busy_ns = 110_000 + k % 97 * 500
+        stamps = (60_000 + k % 13 * 1_000, 350_000, 390_000, 400_000, busy_ns)
+        head = (k, k, k * 1_000_000, ACTIVE, 0, 0, 0, *stamps, k * PERIOD_S)
+        motion = (q, dq, q_des, dq_des, S, sigma, Kd, *BOX, cmd, sent, torque)
+        write(log, k * LAYOUT.size, head, (*motion, q_true, dq_true, mean))
+    return np.frombuffer(bytes(log), LAYOUT.dtype)
 
 
 @cache
 def run_named(name: str):
     """The run of a reference scenario, made once per test session; do not write to it."""
-    rows = run(find_scenario(name))
-    rows.flags.writeable = False
-    return rows
+    return run(find_scenario(name))
 
 
 def shortened(name: str, duration_s: float) -> Scenario:

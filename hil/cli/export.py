@@ -1,0 +1,29 @@
+"""`hil export`: a recording as CSV."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from hil.errors import HilError
+from hil.export import export_csv
+from hil.recording import Recording
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the verb's options."""
+    parser.add_argument("recording", help="MCAP file")
+    parser.add_argument("--csv", metavar="FILE", required=True, help="- is standard output")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write one row per cycle."""
+    recording = Recording.open(Path(options.recording))
+    if options.csv == "-":
+        export_csv(recording, sys.stdout)
+        return 0
+    try:
+        with Path(options.csv).open("w", encoding="ascii", newline="") as file:
+            export_csv(recording, file)
+    except OSError as error:
+        raise HilError(f"{options.csv}: {error.strerror}") from error
+    return 0

@@ -1,0 +1,59 @@
+"""Options that several verbs share, and the configuration they lead to."""
+
+import argparse
+from typing import Any
+
+from hil.client import DEFAULT_ENDPOINT
+from hil.config import Config, load_config, merge, parse_assignment
+from hil.experiment import scenario_settings
+from hil.scenarios import find_scenario
+
+
+def add_configuration(parser: argparse.ArgumentParser) -> None:
+    """Add the options that select and change the configuration."""
+    parser.add_argument("--config", metavar="FILE", help="TOML file (default: presets alone)")
+    parser.add_argument("--scenario", metavar="NAME", help="reference scenario: A0, A, B or E")
+    parser.add_argument(
+        "--bus", metavar="ADDRESS", help="unix:PATH, vcan0, socketcan:can0, python-can:KIND:CHANNEL"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="TABLE.KEY=VALUE",
+        dest="assignments",
+        help="change any setting; entries of a list by number: axes.1.node_id=5",
+    )
+
+
+def configuration(options: argparse.Namespace) -> Config:
+    """Load the configuration the options ask for.
+
+    Raises:
+        ConfigError: With one line that names the setting.
+        ScenarioError: If there is no such scenario.
+    """
+    over: dict[str, Any] = {}
+    if options.scenario is not None:
+        over = scenario_settings(find_scenario(options.scenario))
+    if options.bus is not None:
+        over = merge(over, {"bus": {"address": options.bus}})
+    for assignment in options.assignments:
+        over = merge(over, parse_assignment(assignment))
+    return load_config(options.config, over)
+
+
+def add_connection(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which daemon is meant."""
+    parser.add_argument("--arm", default="bench", help="name of the arm (default: %(default)s)")
+    parser.add_argument(
+        "--connect",
+        action="append",
+        metavar="ENDPOINT",
+        help=f"Zenoh endpoint of the daemon or a router (default: {DEFAULT_ENDPOINT})",
+    )
+
+
+def endpoints(options: argparse.Namespace) -> list[str]:
+    """Return the endpoints to connect to."""
+    return options.connect or [DEFAULT_ENDPOINT]

@@ -1,0 +1,77 @@
+"""`hil watch`: follow a running daemon; count its telemetry."""
+
+import argparse
+import json
+import signal
+import threading
+from typing import Any
+
+from hil.cli.options import add_connection, endpoints
+from hil.client import Client
+from hil.fixed_protobuf import Records
+
+
+class Counter:
+    """Counts samples by their sequence numbers."""
+
+    def __init__(self) -> None:
+        self.received = 0
+        self.lost = 0
+        self.first = -1
+        self.last = -1
+
+    def take(self, rows: Records) -> None:
+        """Count one batch."""
+        for seq in rows["seq"].tolist():
+            if self.last < 0:
+                self.first = seq
+            else:
+                self.lost += seq - self.last - 1
+            self.last = seq
+        self.received += len(rows)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the verb's options."""
+    add_connection(parser)
+    parser.add_argument(
+        "--count", action="store_true", help="only count telemetry; JSON at the end"
+    )
+    parser.add_argument("--for", type=float, dest="duration_s", metavar="S", help="end after this")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Follow until SIGINT, SIGTERM or the given time."""
+    ended = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.set())
+    counter = Counter()
+    with Client(options.arm, endpoints(options)) as client:
+        client.on_telemetry(counter.take)
+        if options.count:
+            print("counting", flush=True)
+        else:
+            client.on_status(_print_status)
+            client.on_event(_print_event)
+        ended.wait(options.duration_s)
+    if options.count:
+        print(json.dumps(vars(counter)))
+    else:
+        print(f"telemetry: {counter.received} samples received, {counter.lost} lost")
+    return 0
+
+
+def _print_status(status: dict[str, Any]) -> None:
+    late, busy = status.get("wake_late_us", {}), status.get("busy_us", {})
+    print(
+        f"{status.get('state', '?'):8} cycle {status.get('cycle', 0):>9}  "
+        f"skipped {status.get('overruns', 0)}  "
+        f"late p99 {late.get('p99', 0):.0f} us max {late.get('max', 0):.0f} us  "
+        f"busy p99 {busy.get('p99', 0):.0f} us  {status.get('scheduler', '')}",
+        flush=True,
+    )
+
+
+def _print_event(event: dict[str, Any]) -> None:
+    detail = {k: v for k, v in event.items() if k not in ("t_ns", "cycle", "kind")}
+    print(f"event    cycle {event['cycle']:>9}  {event['kind']}: {json.dumps(detail)}", flush=True)
