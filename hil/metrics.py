@@ -29,7 +29,6 @@ UNITS: Final[dict[str, str]] = {
     "peak_tau_Nm": "Nm",
     "Kd_min": "Nms/rad",
     "Kd_max": "Nms/rad",
-    "duration_s": "s",
 }
 """Figures that can carry a bound, and their units."""
 _SETTLED_RAD: Final = 0.020
@@ -46,7 +45,7 @@ class BoundResult:
     """One figure against its bound.
 
     Attributes:
-        name: Key of `UNITS`; `... (true)` where the plant's truth was judged by the same bound.
+        name: Key of `UNITS`, with ` (true)` where the plant's truth was judged; or `duration_s`.
         joint: From 1; 0 for the run as a whole.
         value: As measured.
         low: Smallest value that passes.
@@ -235,7 +234,7 @@ def check(metrics: Metrics, scenario: Scenario) -> list[BoundResult]:
     shortest_s = scenario.duration_s - _LENGTH_TOLERANCE_S
     results = [_judge("duration_s", 0, metrics.duration_s, (shortest_s, math.inf))]
     for bound in scenario.bounds:
-        for name, values in _figures(metrics, bound.metric):
+        for name, values in figures_named(metrics, bound.metric):
             value = values[bound.joint - 1] if bound.joint <= len(values) else math.nan
             results.append(_judge(name, bound.joint, value, (bound.low, bound.high)))
     return results
@@ -246,7 +245,8 @@ def _judge(name: str, joint: int, value: float, limits: tuple[float, float]) -> 
     return BoundResult(name, joint, value, low, high, passed=low <= value <= high)
 
 
-def _figures(metrics: Metrics, name: str) -> Iterator[tuple[str, PerJoint]]:
+def figures_named(metrics: Metrics, name: str) -> Iterator[tuple[str, PerJoint]]:
+    """Yield (label, values per joint) of a key of `UNITS`; position errors come twice."""
     if hasattr(metrics, name):
         yield name, getattr(metrics, name)
         return
@@ -258,7 +258,7 @@ def _figures(metrics: Metrics, name: str) -> Iterator[tuple[str, PerJoint]]:
 def format_table(results: Sequence[BoundResult]) -> str:
     """Format a verdict as an aligned text table, one line per figure and a last line of count."""
     rows: list[tuple[str, ...]] = [("figure", "joint", "value", "bound", "unit", "verdict")]
-    rows += [_table_row(result) for result in results]
+    rows += [table_row(result) for result in results]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(_align(row, widths)).rstrip() for row in rows]
     lines.insert(1, "  ".join("-" * width for width in widths))
@@ -267,13 +267,14 @@ def format_table(results: Sequence[BoundResult]) -> str:
     return "\n".join((*lines, "", f"{verdict} ({len(results)} checked)" if not failed else verdict))
 
 
-def _table_row(result: BoundResult) -> tuple[str, ...]:
+def table_row(result: BoundResult) -> tuple[str, ...]:
+    """Format one result: figure, joint, value, bound, unit, verdict."""
     return (
         result.name,
         str(result.joint) if result.joint else "-",
         format_figure(result.value),
-        _format_range(result.low, result.high),
-        UNITS[result.name.removesuffix(" (true)")],
+        format_range(result.low, result.high),
+        UNITS.get(result.name.removesuffix(" (true)"), "s"),  # the length of the run is not in it
         "PASS" if result.passed else "FAIL",
     )
 
@@ -291,7 +292,8 @@ def format_figure(value: float) -> str:
     return f"{value:.{min(digits, 6)}f}"
 
 
-def _format_range(low: float, high: float) -> str:
+def format_range(low: float, high: float) -> str:
+    """Format a bound as people write it."""
     if high == math.inf:
         return f">= {low:g}"
     return f"<= {high:g}" if low == 0.0 else f"{low:g} .. {high:g}"

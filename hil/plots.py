@@ -1,6 +1,7 @@
 """The figures of a report, as PNG files: the paper's figs 6 to 12 and the loop's timing."""
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +15,7 @@ from hil.fixed_protobuf import Records
 from hil.scenarios import COUNT_RAD
 
 Array = NDArray[np.float64]
-_STYLE: Final = {
+_STYLE: Final[Any] = {
     "font.size": 9.0,
     "axes.grid": True,
     "grid.alpha": 0.3,
@@ -30,10 +31,13 @@ _COLOURS: Final = (
     *("#6c757d", "#c2577f", "#5f7a1f", "#3f51b5", "#8d5524", "#111111"),
 )
 _DPI: Final = 110
+_MARGINS_IN: Final = (1.1, 0.7, 0.5, 0.35)  # left, right, bottom, top
 _BUCKETS: Final = 2000  # a line is drawn through the extremes of so many intervals
 _TRANSIENT_S: Final = 1.0
 _S_SHOWN_rad_s: Final = 1.0
+_MOST_LEGEND_ENTRIES: Final = 4
 _HISTOGRAM_BINS: Final = 60
+_TRUTH_NOTE: Final = "Strong: the simulated plant itself. Pale: as measured, what the law works on."
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +75,27 @@ class _Curves:
     other_scale: tuple[float, str] | None = None  # factor and label of a scale to the right
 
 
+@contextmanager
+def _canvas(size_in: tuple[float, float], path: Path) -> Iterator[Any]:
+    """Give an empty figure and write it to `path`, the same bytes for the same drawing.
+
+    Margins are fixed: matplotlib's own layout search takes longer than the drawing.
+    """
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Canvas
+
+    with mpl.rc_context(_STYLE):
+        figure = Canvas(figsize=size_in, dpi=_DPI)
+        FigureCanvasAgg(figure)
+        left, right, bottom, top = (
+            margin / size for margin, size in zip(_MARGINS_IN, np.repeat(size_in, 2), strict=True)
+        )
+        figure.subplots_adjust(left, bottom, 1.0 - right, 1.0 - top, wspace=0.28, hspace=0.22)
+        yield figure
+        figure.savefig(path, metadata={"Software": None})
+
+
 def draw_run(span: Span, folder: Path) -> list[Figure]:
     """Draw S, position and velocity errors, torques and gains over time (figs 8 to 12).
 
@@ -93,9 +118,6 @@ def draw_run(span: Span, folder: Path) -> list[Figure]:
         _draw_over_time(span, shown, path)
         figures.append(Figure(path, title, note if is_noted else ""))
     return figures
-
-
-_TRUTH_NOTE: Final = "Strong: the simulated plant itself. Pale: as measured, what the law works on."
 
 
 def _manifold(rows: Records) -> _Curves:
@@ -129,37 +151,34 @@ def _gain(rows: Records) -> _Curves:
 
 
 def _draw_over_time(span: Span, curves: _Curves, path: Path) -> None:
-    """Draw the whole run above, its first second and its steady window below."""
-    with _canvas((9.0, 5.6), path) as figure:
-        grid = figure.add_gridspec(2, 2, height_ratios=(1.1, 1.0))
-        end_s = float(span.t_s[-1])
-        panels = (
-            (grid[0, :], "whole run", (float(span.t_s[0]), end_s)),
-            (grid[1, 0], "start", (float(span.t_s[0]), float(span.t_s[0]) + _TRANSIENT_S)),
-            (grid[1, 1], "steady state", (span.steady_s, end_s)),
-        )
-        for place, title, window_s in panels:
-            axes = figure.add_subplot(place, title=title, xlabel="t [s]", ylabel=curves.label)
-            inside = (span.t_s >= window_s[0]) & (span.t_s <= window_s[1])
-            _draw_panel(axes, span.t_s[inside], curves, inside)
-            axes.margins(x=0.0)
+    """Draw one row per joint: the whole run, its first second, its steady window."""
+    joints = curves.values.shape[1]
+    start_s, end_s = float(span.t_s[0]), float(span.t_s[-1])
+    windows_s = ((start_s, end_s), (start_s, start_s + _TRANSIENT_S), (span.steady_s, end_s))
+    with _canvas((11.0, 0.7 + 1.9 * joints), path) as figure:
+        grid = figure.subplots(joints, len(windows_s), squeeze=False, width_ratios=(1.5, 1.0, 1.2))
+        for axes, title in zip(grid[0], ("whole run", "start", "steady state"), strict=True):
+            axes.set_title(title)
+        for axes in grid[-1]:
+            axes.set_xlabel("t [s]")
+        for joint, row in enumerate(grid):
+            row[0].set_ylabel(f"joint {joint + 1}\n{curves.label}")
+            for axes, (from_s, to_s) in zip(row, windows_s, strict=True):
+                inside = slice(*np.searchsorted(span.t_s, (from_s, np.nextafter(to_s, np.inf))))
+                _draw_panel(axes, span.t_s[inside], curves, (inside, joint))
             if curves.other_scale is not None:
-                _add_scale(axes, *curves.other_scale)
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper right", ncols=min(len(labels), 6))
+                _add_scale(row[-1], *curves.other_scale)
 
 
-def _draw_panel(axes: Any, t_s: Array, curves: _Curves, inside: NDArray[np.bool_]) -> None:  # noqa: ANN401
-    for joint in range(curves.values.shape[1]):
-        colour = _COLOURS[joint % len(_COLOURS)]
-        if curves.pale is not None:
-            axes.plot(
-                *thinned(t_s, curves.pale[inside, joint]), color=colour, alpha=0.3, linewidth=0.6
-            )
-        for limit in curves.limits:
-            axes.plot(*thinned(t_s, limit[inside, joint]), color=colour, ls="--", lw=0.8, alpha=0.7)
-        line = thinned(t_s, curves.values[inside, joint])
-        axes.plot(*line, color=colour, linewidth=1.0, label=f"joint {joint + 1}")
+def _draw_panel(axes: Any, t_s: Array, curves: _Curves, part: tuple[slice, int]) -> None:  # noqa: ANN401
+    colour = _COLOURS[part[1] % len(_COLOURS)]
+    axes.margins(x=0.01)
+    axes.locator_params(axis="y", nbins=5)
+    if curves.pale is not None:
+        axes.plot(*thinned(t_s, curves.pale[part]), color=colour, alpha=0.35, linewidth=0.6)
+    for limit in curves.limits:
+        axes.plot(*thinned(t_s, limit[part]), color="#6c757d", linestyle="--", linewidth=0.9)
+    axes.plot(*thinned(t_s, curves.values[part]), color=colour, linewidth=0.9)
 
 
 def _add_scale(axes: Any, factor: float, label: str) -> None:  # noqa: ANN401
@@ -201,10 +220,10 @@ def draw_gain_surface(beta: Sequence[float], rows: Records, folder: Path) -> Fig
             axes.set(xlabel="|S| [rad/s]", xlim=(0.0, _S_SHOWN_rad_s))
         left.set(title="memberships", ylabel="degree")
         right.set(title="linear consequences and their sum", ylabel="Kd [Nms/rad]")
+        right.plot(s, degrees @ np.asarray(beta), color="#c9ced4", linewidth=5.0, label="Kd, sum")
         _draw_visited_gains(right, rows)
-        right.plot(s, degrees @ np.asarray(beta), color="black", linewidth=1.6, label="Kd")
         left.legend(loc="center right")
-        right.legend(loc="upper right")
+        right.legend(loc="upper right", markerscale=3.0)
     note = "Dots: gains of the run; they lie off the curve where beta has adapted or bounds moved."
     return Figure(path, "Gain over |S| (figs 6, 7)", note)
 
@@ -215,7 +234,8 @@ def _draw_visited_gains(axes: Any, rows: Records) -> None:  # noqa: ANN401
     for joint in range(S.shape[1]):
         colour = _COLOURS[joint % len(_COLOURS)]
         shown = S[:, joint] <= _S_SHOWN_rad_s
-        axes.plot(S[shown, joint], Kd[shown, joint], ".", color=colour, markersize=3, alpha=0.5)
+        label = f"joint {joint + 1}, run" if S.shape[1] <= _MOST_LEGEND_ENTRIES else None
+        axes.plot(S[shown, joint], Kd[shown, joint], ".", color=colour, markersize=2.5, label=label)
 
 
 def draw_timing(samples: Records, period_us: float, folder: Path) -> Figure:
@@ -230,7 +250,7 @@ def draw_timing(samples: Records, period_us: float, folder: Path) -> Figure:
     figures = (("wake_late_ns", "wake-up after the scheduled start"), ("busy_ns", "busy time"))
     with _canvas((9.0, 3.4), path) as figure:
         for axes, (field, title) in zip(figure.subplots(1, 2), figures, strict=True):
-            axes.set(title=title, xlabel="[us]", ylabel="cycles")
+            axes.set(xlabel=f"{title} [us]", ylabel="cycles")
             _draw_histogram(axes, np.maximum(samples[field] / 1e3, 1.0), period_us)
     return Figure(path, "Timing of the loop", "Shorter than 1 us counts as 1 us.")
 
@@ -238,12 +258,15 @@ def draw_timing(samples: Records, period_us: float, folder: Path) -> Figure:
 def _draw_histogram(axes: Any, values_us: Array, period_us: float) -> None:  # noqa: ANN401
     top = max(float(values_us.max()) * 1.2, period_us * 1.3)
     axes.hist(values_us, bins=np.geomspace(1.0, top, _HISTOGRAM_BINS), color="#9db8cc", log=True)
-    axes.set(xscale="log", xlim=(1.0, top))
-    axes.set_ylim(0.6, axes.get_ylim()[1] * 4.0)
-    axes.axvline(
-        period_us, color="#6c757d", linewidth=1.0, ls=":", label=f"period {period_us:g} us"
+    axes.set(xscale="log", xlim=(1.0, top), ylim=(0.6, None))
+    axes.xaxis.set_major_formatter("{x:g}")
+    marks = [("period", period_us, "#6c757d")]
+    percentiles = np.percentile(values_us, (50, 99, 100))
+    colours = ("#2e933c", "#b7791f", "#d1495b")
+    marks += zip(("p50", "p99", "max"), map(float, percentiles), colours, strict=True)
+    for name, value, colour in marks:
+        style = ":" if name == "period" else "-"
+        axes.axvline(value, color=colour, linewidth=1.3, ls=style, label=f"{name} {value:.0f}")
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, columnspacing=1.0, handlelength=1.2
     )
-    marks = zip(("p50", "p99", "max"), np.percentile(values_us, (50, 99, 100)), strict=True)
-    for (name, value), colour in zip(marks, ("#2e933c", "#b7791f", "#d1495b"), strict=True):
-        axes.axvline(value, color=colour, linewidth=1.2, label=f"{name} {value:.0f} us")
-    axes.legend(loc="upper left", ncols=2)

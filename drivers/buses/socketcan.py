@@ -4,14 +4,12 @@ Source: Linux kernel, Documentation/networking/can.rst, section 4.1 (RAW protoco
 """
 
 import errno
-import select
 import socket
 import struct
 from collections.abc import Iterable
-from time import monotonic
 from typing import NoReturn
 
-from drivers.bus import Bus
+from drivers.buses.kernel_socket import SocketBus
 from drivers.errors import BusError
 from drivers.frame import (
     EFF_FLAG,
@@ -39,10 +37,8 @@ _MEMINFO = struct.Struct("=9I")
 _MEMINFO_DROPS = 8
 _FRAMES_PER_CHECK = 64
 
-_FULL = frozenset({errno.ENOBUFS, errno.EAGAIN})
 
-
-class SocketCanBus(Bus):
+class SocketCanBus(SocketBus):
     """One raw socket on one CAN interface.
 
     Error reports of the controller are subscribed to and come out of `recv` with `ERR_FLAG`.
@@ -50,50 +46,18 @@ class SocketCanBus(Bus):
     frames later: the socket's drop counter (`SO_MEMINFO`) is the one that `SO_RXQ_OVFL` attaches
     to each frame, but costs one call in 64 reads instead of a `recvmsg` for every one.
 
+    A full queue of the interface (`ENOBUFS`) loses the frame, counted in `stats.send_failures`:
+    lengthen it with `ip link set can0 txqueuelen 1000`.
+
     Raises:
         BusError: If the kernel has no CAN, or the interface is missing, is down, or is no CAN.
     """
 
     def __init__(self, interface: str) -> None:
-        super().__init__()
+        super().__init__(_open(interface))
         self.interface = interface
-        self._socket = _open(interface)
-        self._readable = (self._socket.fileno(),)
-        self._send = self._socket.send
-        self._receive = self._socket.recv
 
-    def send(self, frame: bytes) -> bool:
-        """Queue one frame for transmission; see `Bus.send`.
-
-        A full queue of the interface (`ENOBUFS`) is counted: raise it with
-        `ip link set can0 txqueuelen 1000`.
-        """
-        try:
-            self._send(frame)
-        except OSError as error:
-            if error.errno not in _FULL:
-                self._raise_gone(error)
-            self.stats.send_failures += 1
-            return False
-        self.stats.frames_sent += 1
-        return True
-
-    def recv(self, timeout_s: float) -> bytes | None:
-        """Return the next frame or error report; see `Bus.recv`."""
-        if timeout_s <= 0.0:
-            return self._poll()
-        deadline_s = monotonic() + timeout_s
-        try:
-            while select.select(self._readable, (), (), timeout_s)[0]:
-                frame = self._poll()
-                if frame is not None:
-                    return frame
-                timeout_s = max(0.0, deadline_s - monotonic())
-        except (OSError, ValueError) as error:  # closed under us
-            self._raise_gone(error)
-        return None
-
-    def _poll(self) -> bytes | None:
+    def _take(self) -> bytes | None:
         try:
             frame = self._receive(FRAME_SIZE)
         except BlockingIOError:
@@ -134,19 +98,10 @@ class SocketCanBus(Bus):
         except OSError as error:
             self._raise_gone(error)
 
-    def _raise_gone(self, error: Exception) -> NoReturn:
+    def _raise_gone(self, error: Exception | None) -> NoReturn:
         if self._socket.fileno() < 0:
             raise BusError(f"the bus socketcan:{self.interface} is closed") from error
         raise BusError(_explain(self.interface, error)) from error
-
-    def fileno(self) -> int:
-        """Descriptor of the socket, -1 once closed."""
-        return self._socket.fileno()
-
-    def close(self) -> None:
-        """Close the socket. Frames already queued are still sent."""
-        self._socket.close()
-        self._readable = (-1,)  # the number may soon be somebody else's
 
 
 def _exactly(can_id: int) -> tuple[int, int]:
@@ -185,7 +140,7 @@ def _enlarge_receive_queue(endpoint: socket.socket) -> None:
         endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
 
 
-def _explain(interface: str, error: Exception) -> str:
+def _explain(interface: str, error: Exception | None) -> str:
     number = error.errno if isinstance(error, OSError) else None
     name = f"no bus socketcan:{interface}"
     if number == errno.ENETDOWN:

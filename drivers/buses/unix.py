@@ -7,10 +7,9 @@ Records keep their borders and their order, and a closed peer is noticed at once
 import select
 import socket
 from contextlib import suppress
-from time import monotonic
 from typing import NoReturn
 
-from drivers.bus import Bus
+from drivers.buses.kernel_socket import SocketBus
 from drivers.errors import BusError
 from drivers.frame import ERR_BIT, FLAGS_INDEX, FRAME_SIZE
 
@@ -40,7 +39,7 @@ def is_hung_up(endpoint: socket.socket) -> bool:
     return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
 
 
-class UnixBus(Bus):
+class UnixBus(SocketBus):
     """Client of the hub that listens at `path`.
 
     Raises:
@@ -48,45 +47,10 @@ class UnixBus(Bus):
     """
 
     def __init__(self, path: str) -> None:
-        super().__init__()
+        super().__init__(_connect(path))
         self.path = path
-        self._socket = _connect(path)
-        self._readable = (self._socket.fileno(),)
-        self._send = self._socket.send
-        self._receive = self._socket.recv
 
-    def send(self, frame: bytes) -> bool:
-        """Queue one frame at the hub; see `Bus.send`."""
-        try:
-            self._send(frame)
-        except BlockingIOError:
-            self.stats.send_failures += 1
-            return False
-        except OSError as error:
-            self._raise_gone(error)
-        self.stats.frames_sent += 1
-        return True
-
-    def recv(self, timeout_s: float) -> bytes | None:
-        """Return the next frame, waiting at most `timeout_s`; see `Bus.recv`.
-
-        Polling is one system call. With a time-out it waits first: answers come one by one, and
-        a read that finds nothing costs more than the wait that finds something.
-        """
-        if timeout_s <= 0.0:
-            return self._poll()
-        deadline_s = monotonic() + timeout_s
-        try:
-            while select.select(self._readable, (), (), timeout_s)[0]:
-                frame = self._poll()
-                if frame is not None:
-                    return frame
-                timeout_s = max(0.0, deadline_s - monotonic())
-        except (OSError, ValueError) as error:  # closed under us
-            self._raise_gone(error)
-        return None
-
-    def _poll(self) -> bytes | None:
+    def _take(self) -> bytes | None:
         try:
             record = self._receive(RECORD_LIMIT)
             while len(record) != FRAME_SIZE:
@@ -111,16 +75,11 @@ class UnixBus(Bus):
         cause = "this end is closed" if is_ours else "the emulator has closed it"
         raise BusError(f"the bus at unix:{self.path} is gone: {cause}") from error
 
-    def fileno(self) -> int:
-        """Descriptor of the socket, -1 once closed."""
-        return self._socket.fileno()
-
     def close(self) -> None:
         """Leave the hub. Frames already sent still reach it."""
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits in `recv`
-        self._socket.close()
-        self._readable = (-1,)  # the number may soon be somebody else's
+        super().close()
 
 
 def _connect(path: str) -> socket.socket:
@@ -132,5 +91,13 @@ def _connect(path: str) -> socket.socket:
     except OSError as error:
         endpoint.close()
         reason = error.strerror or str(error)
-        raise BusError(f"no bus at unix:{path}: {reason}; start `hil emulate` first") from error
+        raise BusError(f"no bus at unix:{path}: {reason}; {_remedy(error)}") from error
     return endpoint
+
+
+def _remedy(error: OSError) -> str:
+    if isinstance(error, PermissionError):
+        return "the bus is for the emulator's user and group"
+    if isinstance(error, BlockingIOError):
+        return "the emulator takes no newcomers: is it stopped?"
+    return "start `hil emulate` first"

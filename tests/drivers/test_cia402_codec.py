@@ -170,7 +170,7 @@ def test_sdo__abort__round_trips_both_ways(index, subindex, code):
 
 
 def test_sdo__expedited_without_size__gives_four_bytes():
-    frame = sdo.parse_sdo_request(bytes.fromhex("226060000A000000"))
+    frame = sdo.parse_sdo_request(bytes.fromhex("2E6060000A000000"))
     assert frame is not None
     assert frame.size is None
     assert frame.data == b"\x0a\0\0\0"

@@ -174,6 +174,7 @@ def test_canopen__rpdos_dropped__faults_the_drive(enabled, arm):
     await_feedback(enabled, Index.TORQUE_ACTUAL, lambda torque: torque == 10)
     enabled.rpdo[1].stop()
     assert enabled.errors.get(timeout=WAIT_S).code == EmcyCode.RPDO_TIMEOUT
+    await_feedback(enabled, Index.STATUSWORD, lambda word: word & 0x4F == codec.Cia402State.FAULT)
     await_feedback(enabled, Index.TORQUE_ACTUAL, lambda torque: torque == 0)
     assert enabled.is_faulted()
     assert not arm.servos[0].is_energised

@@ -55,6 +55,8 @@ def test_state_machine__fault__powers_off_from_every_state(state):
     assert not machine.is_powered
     machine.settle()
     assert machine.state is S.FAULT
+    machine.fail()
+    assert machine.state is S.FAULT  # a second fault starts no second reaction
 
 
 @pytest.mark.parametrize("low_bits", range(16))
@@ -79,6 +81,8 @@ def test_state_machine__bit_7_set__lets_only_power_off_commands_through():
     machine.command(0x8F)
     assert machine.state is S.READY_TO_SWITCH_ON
     machine.state = S.OPERATION_ENABLED
+    machine.command(0x82)
+    assert machine.state is S.QUICK_STOP_ACTIVE
     machine.command(0x80)
     assert machine.state is S.SWITCH_ON_DISABLED
 

@@ -6,12 +6,9 @@ import canopen
 import pytest
 
 from drivers.cia402 import sdo
-from drivers.cia402.codec import Cia402State
 from sim_backend.cia402 import eds
 from sim_backend.cia402.objects import ENTRIES
 from tests.sim_backend.cia402_bench import NODE, Bench
-
-S = Cia402State
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from drivers.cia402 import codec, sdo
 from drivers.cia402.codec import Cia402State, EmcyCode, Index, NmtCommand, NmtState
 from drivers.cia402.sdo import SdoAbort
 from drivers.frame import RTR_FLAG
+from sim_backend.cia402.heartbeat import HeartbeatProducer
 from sim_backend.cia402.node import Cia402Node, Cia402Settings
 from sim_backend.cia402.objects import ENTRIES
 from sim_backend.servo import Servo
@@ -189,6 +190,12 @@ def test_node__heartbeat__is_produced_at_its_period(bench):
     assert bench.sent == [(codec.COB_HEARTBEAT + NODE, b"\x05")] * 5
 
 
+def test_heartbeat_producer__period_no_multiple_of_the_tick__keeps_the_mean_rate():
+    producer = HeartbeatProducer()
+    producer.start(3)
+    assert sum(producer.is_due(0.002) for _ in range(30)) == 20
+
+
 def test_node__settings__reach_the_dictionary():
     bench = Bench(Cia402Settings(heartbeat_ms=50, serial=77), is_lockstep=True)
     assert bench.read(Index.PRODUCER_HEARTBEAT, 0, codec.U16) == 50
@@ -227,6 +234,16 @@ def test_node__injected_fault__goes_through_reaction_and_reset(bench):
     for controlword in (0x06, 0x07, 0x0F):
         bench.cycle(controlword)
     assert bench.state is S.OPERATION_ENABLED
+
+
+def test_node__two_faults__are_one_error_reset(bench):
+    bench.must_write(Index.INJECT_FAULT, 0, codec.U8, 1)
+    bench.must_write(Index.INJECT_FAULT, 0, codec.U8, 2)
+    bench.must_write(Index.INJECT_FAULT, 0, codec.U8, 2)
+    assert bench.take_emcy() == [(0x5001, 0x81), (0x5002, 0x81)]
+    bench.tick()
+    bench.must_write(Index.CONTROLWORD, 0, codec.U16, 0x80)
+    assert bench.take_emcy() == [(0, 0)]
 
 
 def test_node__error_history__keeps_the_newest_first_and_can_be_cleared(bench):

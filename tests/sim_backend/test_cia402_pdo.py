@@ -45,6 +45,13 @@ def test_pdo__remapped__carries_the_new_objects(bench):
     assert bench.take(codec.COB_TPDO1 + NODE) == []
 
 
+def test_pdo__overlong_sync__is_none(bench):
+    bench.nmt(NmtCommand.START)
+    bench.sent.clear()
+    bench.node.receive(codec.COB_SYNC, b"\0\0")
+    assert bench.sent == []
+
+
 def test_pdo__second_rpdo__writes_its_objects_at_once_if_event_driven(bench):
     words = [codec.mapping_word(Index.MODE, 0, 8), codec.mapping_word(Index.MAX_TORQUE, 0, 16)]
     remap(bench, RPDO2, RPDO2_MAPPING, words, cob_id=codec.COB_RPDO2 + NODE, kind=255)

@@ -3,12 +3,10 @@
 import pytest
 
 from drivers.cia402 import codec, sdo
-from drivers.cia402.codec import Cia402State, Index
+from drivers.cia402.codec import Index, NmtCommand
 from drivers.cia402.sdo import SdoAbort, SdoKind
 from sim_backend.cia402.objects import ENTRIES
 from tests.sim_backend.cia402_bench import NODE, Bench
-
-S = Cia402State
 
 
 @pytest.fixture
@@ -59,6 +57,20 @@ def test_sdo_server__device_name__comes_in_segments(bench):
     assert upload_segments(bench, Index.DEVICE_NAME) == (b"hil emulated drive", 18)
 
 
+def test_sdo_server__nmt_start_between_segments__does_not_disturb_them(bench):
+    bench.request(sdo.sdo_upload_request(Index.DEVICE_NAME, 0))
+    bench.nmt(NmtCommand.START)
+    assert bench.request(sdo.sdo_upload_segment_request(0)).data == b"hil emu"
+
+
+def test_sdo_server__stopped__takes_nothing(bench):
+    bench.nmt(NmtCommand.STOP)
+    request = sdo.sdo_download_request(Index.PRODUCER_HEARTBEAT, 0, codec.U16.pack(500))
+    bench.node.receive(codec.COB_SDO_RX + NODE, request)
+    bench.nmt(NmtCommand.ENTER_PRE_OPERATIONAL)
+    assert bench.read(Index.PRODUCER_HEARTBEAT, 0, codec.U16) == 0
+
+
 def test_sdo_server__toggle_not_alternated__aborts_and_ends_the_transfer(bench):
     bench.request(sdo.sdo_upload_request(Index.DEVICE_NAME, 0))
     bench.request(sdo.sdo_upload_segment_request(0))
@@ -85,7 +97,8 @@ def test_sdo_server__segmented_download__stores_the_value(bench):
 )
 def test_sdo_server__segments_of_another_length__change_nothing(bench, segment, code):
     start_segmented_download(bench, 0x1017, 2)
-    answer = bench.request(sdo.sdo_download_segment_request(0, segment, is_last=True))
+    is_last = code is SdoAbort.LENGTH_TOO_LOW  # too much is noticed without waiting for the end
+    answer = bench.request(sdo.sdo_download_segment_request(0, segment, is_last=is_last))
     assert answer.abort_code == code
     assert bench.read(0x1017, 0, codec.U16) == 0
 

@@ -83,6 +83,30 @@ def test_node__enabling_rpdo_alone__arms_the_deadline(bench):
     assert bench.state is S.FAULT
 
 
+def test_node__enabled_again_by_sdo__waits_for_a_new_first_rpdo(bench):
+    lose_rpdos(bench, timeout_ms=10)
+    for controlword in (0x00, 0x06, 0x07, 0x0F):
+        bench.must_write(Index.CONTROLWORD, 0, codec.U16, controlword)
+        bench.tick(0.005)
+    bench.tick(1.0)
+    assert bench.state is S.OPERATION_ENABLED
+    bench.rpdo(0x0F, 100)
+    bench.tick(0.02)
+    assert bench.state is S.FAULT
+
+
+def test_node__heartbeat_back_in_fault__leaves_the_error_until_the_reset(bench):
+    lose_heartbeat(bench, timeout_ms=20)
+    bench.tick(0.1)
+    bench.take_emcy()
+    bench.node.receive(codec.COB_HEARTBEAT + MASTER, b"\x05")
+    assert bench.take_emcy() == []
+    assert bench.read(Index.ERROR_REGISTER, 0, codec.U8) == 0x11
+    bench.cycle(0x80)
+    assert bench.take_emcy() == [(0, 0)]
+    assert bench.state is S.SWITCH_ON_DISABLED
+
+
 def test_node__heartbeat_lost_while_disabled__reports_without_fault_and_recovers(bench):
     setting = codec.consumer_heartbeat(MASTER, 20)
     bench.must_write(Index.CONSUMER_HEARTBEAT, 1, codec.U32, setting)
