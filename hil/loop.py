@@ -31,7 +31,7 @@ from hil.realtime import (
 from hil.sampler import Sampler, Stamps
 from hil.shared import STATUS_EVERY_S, SharedMemory
 
-GATEWAY_TIMEOUT_NS = 1_000_000_000
+GATEWAY_TIMEOUT_NS = 2_000_000_000
 FAREWELL_CYCLES = 5
 """Cycles run after power went off, so that every amplifier has the last word."""
 
@@ -46,8 +46,10 @@ class Loop:
         self._bus = bus
         self._infos = infos
         self._period_ns = round(config.loop.period_s * 1e9)
-        self._timeout_ns = round(config.loop.feedback_timeout_s * 1e9)
         self._is_lockstep = infos[0].is_lockstep
+        timing = config.loop
+        timeout_s = timing.lockstep_timeout_s if self._is_lockstep else timing.feedback_timeout_s
+        self._timeout_ns = round(timeout_s * 1e9)
         self._control = Control(config, bus, now_ns=now_ns, events=self._emit)
         self._executor = Executor(self._control, shared.rows, self._report_outcome)
         self._sampler = Sampler(shared.layout, self._control, bus)

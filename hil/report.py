@@ -271,4 +271,5 @@ def _events(recording: Recording) -> Iterator[Block]:
 
 
 def _detail(event: RecordedEvent) -> str:
-    return ", ".join(f"{key} = {_plain(value)}" for key, value in event.detail.items())
+    given = ((key, value) for key, value in event.detail.items() if value != "")
+    return ", ".join(f"{key} = {_plain(value)}" for key, value in given)

@@ -74,7 +74,7 @@ class Drive:
         """Take the state after power-up: no mode, torque 0, limit at what the servo can do."""
         self.mode = 0
         self.target_torque = 0
-        peak = int(self._servo.torque_max_Nm / self._Nm_per_mille)
+        peak = round(self._servo.torque_max_Nm / self._Nm_per_mille)
         self.max_torque = min(peak, _U16_MAX)
         self.machine.initialise()
         self._follow_state()
@@ -209,4 +209,7 @@ class Drive:
 
 
 def _to_i16(value: float) -> int:
-    return max(_I16_MIN, min(_I16_MAX, round(value)))
+    rounded = round(value)
+    if _I16_MIN <= rounded <= _I16_MAX:
+        return rounded
+    return _I16_MIN if rounded < 0 else _I16_MAX

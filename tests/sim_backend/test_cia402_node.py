@@ -51,6 +51,20 @@ def test_node__torque_and_current_actual__are_per_mille_of_the_ratings():
     assert bench.read(Index.TORQUE_ACTUAL, 0, codec.I16) == -600
 
 
+@pytest.mark.parametrize(("current_A", "shown"), [(10.0, 32767), (-10.0, -32768)])
+def test_node__actual_beyond_sixteen_bits__stays_at_the_end_of_the_range(current_A, shown):
+    bench = Bench(Cia402Settings(rated_torque_Nm=0.1))
+    bench.servo.current_A = current_A
+    assert bench.read(Index.TORQUE_ACTUAL, 0, codec.I16) == shown
+    assert bench.read(Index.MAX_TORQUE, 0, codec.U16) == 65535
+
+
+def test_node__default_ratings__are_the_servo_at_peak_current(bench):
+    assert bench.read(Index.RATED_TORQUE, 0, codec.U32) == 15_000
+    assert bench.read(Index.RATED_CURRENT, 0, codec.U32) == 10_000
+    assert bench.read(Index.MAX_TORQUE, 0, codec.U16) == 1000
+
+
 def test_node__position_and_velocity__are_single_turn_counts(bench):
     bench.servo.sense(-math.tau / 4, math.pi)
     assert bench.read(Index.POSITION_ACTUAL, 0, codec.I32) == 3072
