@@ -91,16 +91,15 @@ class SelfTuningGain(Gain):
         self._mu = (0.0, 0.0, 0.0)
         self.beta = [self._box(beta) for beta in settings.beta]
         self._place = [0.0, 0.0, 0.0]
-        self._note_places()
 
     def step(self, S: float, dt_s: float) -> float:
         """Return Kd_hat for this cycle; see the class."""
-        if self._rate_per_s != 0.0:
-            self._adapt(S, dt_s)
         if self._goal is not None:
             self._ramp_bounds(dt_s)
             span = self.Kd_max - self.Kd_min
             self.beta = [self.Kd_min + place * span for place in self._place]
+        elif self._rate_per_s != 0.0:
+            self._adapt(S, dt_s)
         big, medium, small = self._mu = memberships(S if S >= 0.0 else -S)
         beta = self.beta
         Kd = beta[BIG] * big + beta[MEDIUM] * medium + beta[SMALL] * small
@@ -108,17 +107,22 @@ class SelfTuningGain(Gain):
             return self.Kd_min
         return Kd if Kd < self.Kd_max else self.Kd_max
 
-    def _adapt(self, S: float, dt_s: float) -> None:
-        step = self._rate_per_s * dt_s * (abs(S) if self._is_absolute else S)
-        self.beta = [
-            self._box(beta + step * mu) for beta, mu in zip(self.beta, self._mu, strict=True)
-        ]
-        self._note_places()
-
-    def _box(self, beta: float) -> float:
-        return max(self.Kd_min, min(self.Kd_max, beta))
-
-    def _note_places(self) -> None:
+    def set_bounds(self, Kd_min: float, Kd_max: float) -> None:
+        """Let the bounds move; every beta keeps its place between them."""
         span = self.Kd_max - self.Kd_min
         if span > 0.0:
             self._place = [(beta - self.Kd_min) / span for beta in self.beta]
+        super().set_bounds(Kd_min, Kd_max)
+
+    def _adapt(self, S: float, dt_s: float) -> None:
+        step = self._rate_per_s * dt_s * (abs(S) if self._is_absolute else S)
+        big, medium, small = self._mu
+        beta = self.beta
+        beta[BIG] = self._box(beta[BIG] + step * big)
+        beta[MEDIUM] = self._box(beta[MEDIUM] + step * medium)
+        beta[SMALL] = self._box(beta[SMALL] + step * small)
+
+    def _box(self, beta: float) -> float:
+        if beta < self.Kd_min:
+            return self.Kd_min
+        return beta if beta < self.Kd_max else self.Kd_max

@@ -83,4 +83,5 @@ def run_in_simulation(
             )
         simulation.execute("disable")
         simulation.run_until(State.IDLE, STOP_CYCLES)
+        simulation.close()
         return simulation.cycle * period_s

@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import signal
 import sys
 from collections.abc import Mapping
@@ -29,7 +30,7 @@ from hil.realtime import (
     usage,
 )
 from hil.sampler import Sampler, Stamps
-from hil.shared import STATUS_EVERY_S, SharedMemory
+from hil.shared import FRAMES_AT_ONCE, STATUS_EVERY_S, SharedMemory
 
 GATEWAY_TIMEOUT_NS = 2_000_000_000
 FAREWELL_CYCLES = 5
@@ -61,8 +62,8 @@ class Loop:
         self._has_gateway = False
         self._is_ending = False
         self._granted = Granted("SCHED_OTHER", memory_locked=False, missing=())
-        self._write_frame = shared.frame_layout.writer()
-        self._frame_size = shared.frame_layout.size
+        self._entry = shared.frame_layout.entry
+        self._frames: list[bytes] = []
 
     def run(self, granted: Granted) -> None:
         """Run cycles until a signal ends the loop and torque is off.
@@ -72,6 +73,16 @@ class Loop:
         """
         self._granted = granted
         self._bus.log_frames(self._log_frame)
+        self._emit(
+            "start",
+            {
+                "amplifiers": [info.name for info in self._infos],
+                "is_lockstep": self._is_lockstep,
+                "scheduler": granted.scheduler,
+                "kernel": platform.release(),
+                "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+            },
+        )
         self._control.fire(Trigger.BUS_READY)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._end)
@@ -118,6 +129,7 @@ class Loop:
         offset = ring.begin(self._shared.layout.size)
         self._sampler.write(ring.memory, offset, (self._cycle, start_ns, self._overruns), stamps)
         ring.commit()
+        self._flush_frames()
         self._shared.beat("loop", sent_ns)
 
     # --- every 100 ms ------------------------------------------------------------------------
@@ -181,9 +193,13 @@ class Loop:
         )
 
     def _log_frame(self, direction: int, frame: bytes) -> None:
-        ring = self._shared.frames
-        self._write_frame(ring.memory, ring.begin(self._frame_size), now_ns(), direction, frame)
-        ring.commit()
+        self._frames.append(self._entry(now_ns(), direction, frame))
+        if len(self._frames) == FRAMES_AT_ONCE:
+            self._flush_frames()
+
+    def _flush_frames(self) -> None:
+        self._shared.frames.append(b"".join(self._frames))
+        self._frames.clear()
 
     def _end(self, *_: object) -> None:
         """Signal handler: from the next cycle on, come to a damped stop, then end."""

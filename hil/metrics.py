@@ -126,17 +126,21 @@ class Metrics:
     timing: Timing
 
 
-def measure(samples: Records, *, stat_start_s: float | None = None) -> Metrics:
+def measure(
+    samples: Records, *, stat_start_s: float | None = None, end_s: float = math.inf
+) -> Metrics:
     """Take the figures of the longest trajectory in `samples`.
 
     Args:
         samples: Columns of `hil.v1.Sample`, as `Recording.samples`.
         stat_start_s: Start of the statistics window; None takes the last 40 % of the run.
+        end_s: What follows this time along the trajectory (the braking) is left out.
 
     Raises:
         MetricsError: If no trajectory ran, or it ended before the statistics window begins.
     """
     run = trajectory_rows(samples)
+    run = run[run["t_ref_s"] <= end_s]
     t_s = np.asarray(run["t_ref_s"], dtype=np.float64)
     start_s = float(_DEFAULT_STAT_SHARE * t_s[-1]) if stat_start_s is None else stat_start_s
     steady = t_s >= start_s
@@ -161,6 +165,15 @@ def measure(samples: Records, *, stat_start_s: float | None = None) -> Metrics:
         Kd_max=_per_joint(run["Kd"].max(axis=0)),
         timing=timing(samples),
     )
+
+
+def measure_scenario(samples: Records, scenario: Scenario) -> Metrics:
+    """Take the figures of a scenario's run over its own length and statistics window.
+
+    Raises:
+        MetricsError: As for `measure`.
+    """
+    return measure(samples, stat_start_s=scenario.stat_start_s, end_s=scenario.duration_s)
 
 
 def trajectory_rows(samples: Records) -> Records:

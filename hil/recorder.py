@@ -39,9 +39,9 @@ class Recorder:
             ):
                 self._writer.add_sample(t_ns, seq, record)
         while records := self._frames.read(AT_ONCE):
-            log = self._shared.frame_layout.log(records)
-            first = self._shared.frame_layout.decode_log(self._shared.frame_layout.log(records[:1]))
-            self._writer.add_bus_log(first[0].t_ns, log)
+            log = b"".join(records)
+            first = self._shared.frame_layout.decode_log(log[: self._shared.frame_layout.size])[0]
+            self._writer.add_bus_log(first.t_ns, log)
         for record in self._events.read(AT_ONCE):
             event = json.loads(record)
             t_ns, cycle, kind = event.pop("t_ns"), event.pop("cycle"), event.pop("kind")

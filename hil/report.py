@@ -17,6 +17,7 @@ from hil.metrics import (
     figures_named,
     format_figure,
     measure,
+    measure_scenario,
     table_row,
     timing,
     trajectory_rows,
@@ -102,8 +103,10 @@ def _blocks(recording: Recording, folder: Path) -> Iterator[Block]:
     yield Heading("Figures")
     metrics: Metrics | None = None
     try:
-        metrics = measure(
-            recording.samples, stat_start_s=scenario.stat_start_s if scenario else None
+        metrics = (
+            measure_scenario(recording.samples, scenario)
+            if scenario
+            else measure(recording.samples)
         )
     except MetricsError as error:
         yield Paragraph(f"No figures: {error}.")
@@ -129,12 +132,25 @@ def _setting(config: Mapping[str, Any], path: str) -> Any:  # noqa: ANN401 - JSO
 def _facts(recording: Recording) -> Iterator[tuple[str, str]]:
     rows = recording.samples
     yield "recorded", f"{len(rows)} samples over {np.ptp(rows['t_ns'].astype(np.int64)) / 1e9:g} s"
-    yield "plant", "simulated, its truth is recorded" if recording.has_truth else "hardware"
+    yield "back-end", _back_end(recording)
     yield "joints", str(recording.joints)
     for title, path in _FACTS.items():
         value = _setting(recording.config, path)
         if value is not None:
             yield title, _plain(value)
+
+
+def _back_end(recording: Recording) -> str:
+    """Say what was controlled, and by which machine, as far as the recording tells."""
+    if recording.has_truth:
+        return "simulation in virtual time, the plant's truth recorded"
+    start = next((event.detail for event in recording.events if event.kind == "start"), {})
+    amplifiers = ", ".join(dict.fromkeys(start.get("amplifiers", ["unknown amplifiers"])))
+    mode = "lockstep" if start.get("is_lockstep") else "by the clock"
+    host = (
+        f"{start.get('scheduler', '?')} on {start.get('kernel', '?')}, {start.get('machine', '?')}"
+    )
+    return f"{amplifiers} on {_setting(recording.config, 'bus.address')}, {mode}; loop: {host}"
 
 
 def _plain(value: Any) -> str:  # noqa: ANN401 - JSON

@@ -26,6 +26,8 @@ _CONFIG_SIZE = 64 << 10
 _EVENT_BYTES = 2048
 STATUS_EVERY_S: Final = 0.1
 """Period of the loop's status."""
+FRAMES_AT_ONCE: Final = 32
+"""Bus frames in one record at the most; a cycle with more writes several records."""
 SLOTS: Final = 3
 """Trajectory slots: one being played, one waiting, one being written."""
 
@@ -124,7 +126,7 @@ class SharedMemory:
     Attributes:
         config: The running configuration.
         samples: Ring of serialised `Sample`, written by the loop.
-        frames: Ring of serialised `BusFrame`, written by the loop.
+        frames: Ring of serialised `BusLog`, one or more a cycle, written by the loop.
         events: Ring of JSON events, written by the loop.
         commands: Ring of JSON commands, written by the gateway.
         layout: Layout of a sample.
@@ -220,7 +222,7 @@ def _plan(config: Config, sample_size: int, frame_size: int) -> dict[str, tuple[
     cycles = round(ring_s / period_s)
     rings = {
         "samples": (sample_size, cycles),
-        "frames": (frame_size, cycles * (3 * n + 4)),
+        "frames": (frame_size * FRAMES_AT_ONCE, cycles),
         "events": (_EVENT_BYTES, 512),
         "commands": (_EVENT_BYTES, 64),
         "status": (_EVENT_BYTES, 2),

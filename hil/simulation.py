@@ -24,6 +24,8 @@ from hil.telemetry import BusFrameLayout, SampleLayout
 from sim_backend.arm import Arm
 from sim_backend.emulator import Emulator
 
+FRAMES_EVERY = 50
+"""Cycles whose frames are recorded together."""
 NO_STAMPS = Stamps()
 """Virtual time stands still within a cycle."""
 
@@ -50,9 +52,8 @@ class Simulation:
         self._period_ns = round(config.loop.period_s * 1e9)
         self._clock_ns = 0
         self._is_starting = True
-        self._frame_layout = BusFrameLayout()
-        self._write_frame = self._frame_layout.writer()
-        self._log = bytearray()
+        self._entry = BusFrameLayout().entry
+        self._log: list[bytes] = []
         self._log_ns = 0
         self._emulator: Emulator | None = None
         self._plant: Emulator | IdealArm
@@ -93,7 +94,8 @@ class Simulation:
         if self._recording is not None:
             self._sampler.write(self._sample, 0, stamp, NO_STAMPS)
             self._recording.add_sample(self._clock_ns, self._sampler.seq - 1, bytes(self._sample))
-            self._flush_frames()
+            if self.cycle % FRAMES_EVERY == 0:
+                self._flush_frames()
         self.cycle += 1
         self._clock_ns += self._period_ns
 
@@ -162,17 +164,18 @@ class Simulation:
 
     def _log_frame(self, direction: int, frame: bytes) -> None:
         self.frames += 1
-        at = len(self._log)
-        self._log += bytes(self._frame_layout.size)
-        self._write_frame(self._log, at, self._clock_ns, direction, frame)
+        if not self._log:
+            self._log_ns = self._clock_ns
+        self._log.append(self._entry(self._clock_ns, direction, frame))
 
     def _flush_frames(self) -> None:
-        size = self._frame_layout.size
-        log = memoryview(self._log)
-        frames = [log[at : at + size] for at in range(0, len(log), size)]
-        if frames and self._recording is not None:
-            self._recording.add_bus_log(self._clock_ns, self._frame_layout.log(frames))
-        self._log = bytearray()
+        if self._log and self._recording is not None:
+            self._recording.add_bus_log(self._log_ns, b"".join(self._log))
+        self._log = []
+
+    def close(self) -> None:
+        """Record what is left; the recording itself stays open."""
+        self._flush_frames()
 
 
 def open_recording(config: Config, path: Path) -> RecordingWriter:

@@ -20,8 +20,8 @@ from hil.proto import telemetry_pb2
 Buffer = bytearray | memoryview
 SampleWriter = Callable[[Buffer, int, Sequence[float], Sequence[Sequence[float]]], None]
 """`write(buffer, offset, scalars, joint_lists)`; see `SampleLayout.writer`."""
-FrameWriter = Callable[[Buffer, int, int, int, bytes], None]
-"""`write(buffer, offset, t_ns, direction, frame)`; see `BusFrameLayout.writer`."""
+FrameEntry = Callable[[int, int, bytes], bytes]
+"""`entry(t_ns, direction, frame)`; see `BusFrameLayout.entry`."""
 
 RECEIVED: Final = 0
 SENT: Final = 1
@@ -201,8 +201,9 @@ class BusFrameLayout:
         frame_size: 16 for `struct can_frame`, 72 for `struct canfd_frame`.
 
     Attributes:
-        size: Bytes of one serialised frame.
-        dtype: Structured dtype with the columns `t_ns`, `direction`, `frame`.
+        size: Bytes of one entry of a log.
+        entry: Serialises one frame as an entry of a `hil.v1.BusLog`: joined entries are a log. It
+            takes (t_ns, direction, frame), the frame being exactly one record.
     """
 
     def __init__(self, frame_size: int = 16) -> None:
@@ -211,29 +212,19 @@ class BusFrameLayout:
         self._messages = FixedMessages(
             (scalar_field(t_ns), scalar_field(direction), run_field(frame, "s", frame_size, 1))
         )
-        self.size: Final = self._messages.size
-        self.dtype: Final = self._messages.dtype
+        self.size: Final = len(self._messages.prefix) + self._messages.size
+        self.entry: Final[FrameEntry] = self._entry()
 
-    def writer(self) -> FrameWriter:
-        """Return a function that writes one valid bus frame into a buffer.
-
-        It takes (buffer, offset, t_ns, direction, frame), the frame being exactly one record.
-        """
-        pack = self._messages.struct.pack_into
+    def _entry(self) -> FrameEntry:
         at, way, data = (field.constant for field in self._messages.fields)
+        head = self._messages.prefix + at
+        layout = f"<{len(head)}sq{len(way)}sI{len(data)}s{self.frame_size}s"
+        pack = struct.Struct(layout).pack
 
-        def write(buffer: Buffer, offset: int, t_ns: int, direction: int, frame: bytes) -> None:
-            pack(buffer, offset, at, t_ns, way, direction, data, frame)
+        def entry(t_ns: int, direction: int, frame: bytes) -> bytes:
+            return pack(head, t_ns, way, direction, data, frame)
 
-        return write
-
-    def log(self, frames: Sequence[bytes | memoryview]) -> bytes:
-        """Concatenate serialised bus frames into a serialised `hil.v1.BusLog`.
-
-        Raises:
-            ValueError: If a frame is not of this layout's size.
-        """
-        return self._messages.join(frames)
+        return entry
 
     def decode_log(self, payload: bytes) -> list[LoggedFrame]:
         """Read a serialised `hil.v1.BusLog`, whoever wrote it, in the order of the log.

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hil.metrics import Metrics, check, format_figure, format_table, measure
+from hil.metrics import Metrics, check, format_figure, format_table, measure, measure_scenario
 from hil.recording import Recording
 from hil.scenarios import SCENARIOS
 
@@ -18,7 +18,7 @@ def judge(path: Path) -> tuple[str, bool]:
     scenario = SCENARIOS.get(recording.config.get("scenario") or "")
     if scenario is None:
         return _figures(measure(recording.samples)), True
-    metrics = measure(recording.samples, stat_start_s=scenario.stat_start_s)
+    metrics = measure_scenario(recording.samples, scenario)
     results = check(metrics, scenario)
     head = (
         f"scenario {scenario.name} ({scenario.preset}), statistics from {scenario.stat_start_s:g} s"

@@ -36,12 +36,7 @@ def sample(k: int, layout: SampleLayout = LAYOUT) -> bytes:
 
 
 def bus_log(frames) -> bytes:
-    layout = BusFrameLayout()
-    write, written = layout.writer(), []
-    for frame in frames:
-        written.append(bytearray(layout.size))
-        write(written[-1], 0, *frame)
-    return layout.log(written)
+    return b"".join(BusFrameLayout().entry(*frame) for frame in frames)
 
 
 def record(path: Path, count: int = 250) -> Path:

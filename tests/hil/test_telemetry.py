@@ -256,12 +256,9 @@ def records(least, most):
 @given(st.lists(records(16, 16), max_size=5))
 def test_bus_frame_layout__any_frames__generated_class_and_decoder_agree(logged):
     layout = BusFrameLayout()
-    write_frame, buffer = layout.writer(), bytearray(layout.size)
-    written = []
-    for frame in logged:
-        write_frame(buffer, 0, *frame)
-        written.append(bytes(buffer))
-    log = layout.log(written)
+    entries = [layout.entry(*frame) for frame in logged]
+    assert all(len(entry) == layout.size for entry in entries)
+    log = b"".join(entries)
     message = telemetry_pb2.BusLog.FromString(log)
     assert [(f.t_ns, f.direction, f.frame) for f in message.frames] == logged
     assert layout.decode_log(log) == [LoggedFrame(*frame) for frame in logged]
@@ -284,9 +281,8 @@ def test_decode_log__any_bytes__frames_or_telemetry_error(payload):
 
 def test_bus_frame_layout__can_fd_record__constant_size():
     layout = BusFrameLayout(72)
-    buffer = bytearray(layout.size)
-    layout.writer()(buffer, 0, 5, SENT, bytes(range(72)))
-    assert layout.decode_log(layout.log([buffer])) == [LoggedFrame(5, SENT, bytes(range(72)))]
+    log = layout.entry(5, SENT, bytes(range(72)))
+    assert layout.decode_log(log) == [LoggedFrame(5, SENT, bytes(range(72)))]
 
 
 def test_writer__nan_and_infinities__kept():

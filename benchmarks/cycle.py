@@ -1,0 +1,193 @@
+"""Busy time of a control cycle over the 1000 us period, against a real `hil emulate` process.
+
+A cycle is: send SYNC, receive, estimate, law, limits, send torques, by the real `Control` and
+`ArmBus`. CPU time is the thread's. Wall time leaves out the waiting for feedback: the emulator's
+work. Blocks with either clock alternate, since taking the one would cost the other time.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter_ns, thread_time_ns
+
+from benchmarks import rig
+from benchmarks.measure import (
+    Target,
+    at_most,
+    percentile,
+    row,
+    title,
+    us,
+    without_garbage_collection,
+)
+from benchmarks.waiting import WaitTimer
+from controller.machine import State, Trigger
+from drivers.arm_bus import ArmBus
+from drivers.bus import open_bus
+from drivers.registry import make_axes
+from hil.config import Config
+from hil.control import Control
+from hil.loop import Loop
+from hil.realtime import Granted, Sleeper, now_ns
+from hil.shared import SharedMemory
+
+PERIOD_NS = 1_000_000
+BLOCK_CYCLES = 500
+WARM_UP_CYCLES = 200
+ENABLE_CYCLES = 1000
+CYCLES = 10_000
+WHOLE_BODY_CYCLES = 4_000
+TIMEOUT_NS = 400_000_000  # of feedback, as the loop's own in lockstep
+
+
+@dataclass(slots=True)
+class Busy:
+    """Busy times of single cycles in us."""
+
+    cpu: list[float] = field(default_factory=list)
+    wall: list[float] = field(default_factory=list)
+    waiting: list[float] = field(default_factory=list)
+
+
+class Arm:
+    """The controller's side of the unix bus, tracking scenario A.
+
+    The trajectory starts again when it is over.
+    """
+
+    def __init__(self, config: Config, *, is_whole_body: bool) -> None:
+        self.config = config
+        self.bus = WaitTimer(open_bus(config.bus.address))
+        self.arm = ArmBus(
+            self.bus, make_axes(config.axes, period_s=config.loop.period_s), now_ns=now_ns
+        )
+        infos = self.arm.configure(heartbeat_cycles=100)
+        self._loop: Loop | None = None
+        if is_whole_body:
+            shared = SharedMemory.create(config)
+            self._loop = Loop(shared, self.arm, infos)
+            self._loop._granted = Granted("", memory_locked=False, missing=())
+            self.arm.log_frames(self._loop._log_frame)
+            self.control = self._loop._control
+        else:
+            self.control = Control(config, self.arm, now_ns=now_ns, events=lambda *_: None)
+        self.control.fire(Trigger.BUS_READY)
+        self._enable()
+
+    def _enable(self) -> None:
+        self.control.enable()
+        for _ in range(ENABLE_CYCLES):
+            self.step(now_ns())
+            if self.control.machine.state is State.READY:
+                break
+        motion = rig.reference(self.config, self.control.player.setpoint.q_rad)
+        self._rows = memoryview(motion.rows().tobytes()).cast("d")
+        self._samples = motion.samples
+
+    def step(self, start_ns: int) -> None:
+        """One cycle: `Control.step` alone, or everything the loop process does in it."""
+        if self._loop is None:
+            self.control.step(start_ns + TIMEOUT_NS, 1)
+            return
+        self._loop._run_cycle(start_ns, start_ns, 1)
+        self._loop._cycle += 1
+
+    def restart(self) -> None:
+        """Begin the trajectory anew, between two measured blocks."""
+        if not self.control.player.is_moving:
+            self.control.start(self._rows, self._samples, at_index=None)
+
+    def close(self) -> None:
+        self.control.estop()
+        self.step(now_ns())
+        self.step(now_ns())
+        self.bus.close()
+
+
+def run(scale: float) -> list[Target]:
+    title("cycle", "busy time of one control cycle, unix bus, lockstep, 2 joints, scenario A")
+    row("", "cpu p50", "cpu p99", "wall p50", "wall p99", "of 1000 us")
+    with rig.emulator_process() as address:
+        config = rig.configuration(address)
+        paced = _measure(config, round(CYCLES * scale), is_paced=True, is_whole_body=False)
+        name = _print("control cycle at 1 kHz", paced)
+        unpaced = _measure(config, round(CYCLES * scale), is_paced=False, is_whole_body=False)
+        _print("control cycle, unpaced", unpaced)
+        cycles = round(WHOLE_BODY_CYCLES * scale)
+        whole = _measure(config, cycles, is_paced=True, is_whole_body=True)
+        _print("the loop's whole body at 1 kHz (*)", whole)
+    print(f"  waiting for feedback at 1 kHz (emulator's time): p50 {us(_p50(paced.waiting))}")
+    print("  (*) also commands, frame log, sample into the ring, heartbeat")
+    return [
+        at_most(f"{name}: busy p50, CPU", _p50(paced.cpu) / 10.0, 10.0, " %"),
+        at_most(f"{name}: busy p50, wall", _p50(paced.wall) / 10.0, 10.0, " %"),
+    ]
+
+
+def _p50(values: list[float]) -> float:
+    return percentile(values, 0.5)
+
+
+def _print(label: str, busy: Busy) -> str:
+    cells = [percentile(v, p) for v in (busy.cpu, busy.wall) for p in (0.5, 0.99)]
+    shares = f"{cells[0] / 10.0:.1f}/{cells[2] / 10.0:.1f} %"
+    row(label, *map(us, cells), shares)
+    return label
+
+
+def _measure(config: Config, cycles: int, *, is_paced: bool, is_whole_body: bool) -> Busy:
+    busy = Busy()
+    arm = Arm(config, is_whole_body=is_whole_body)
+    start = _wait_for_period if is_paced else now_ns
+    try:
+        with rig.scheduled_as_loop(config.loop.priority), without_garbage_collection():
+            _run_block(arm, WARM_UP_CYCLES, start, _time_cpu, Busy())
+            blocks = max(1, cycles // BLOCK_CYCLES // 2)
+            for _ in range(blocks):
+                arm.restart()
+                arm.bus.set_timed(False)
+                _run_block(arm, BLOCK_CYCLES, start, _time_cpu, busy)
+                arm.bus.set_timed(True)
+                _run_block(arm, BLOCK_CYCLES, start, _time_wall, busy)
+                arm.bus.set_timed(False)
+    finally:
+        arm.close()
+    return busy
+
+
+_sleeper = Sleeper()
+
+
+def _wait_for_period() -> int:
+    """Sleep until the next whole millisecond and return that instant."""
+    start_ns = (now_ns() // PERIOD_NS + 1) * PERIOD_NS
+    _sleeper.until(start_ns)
+    return start_ns
+
+
+def _run_block(
+    arm: Arm,
+    cycles: int,
+    start: Callable[[], int],
+    time_cycle: Callable[[Arm, int, Busy], None],
+    busy: Busy,
+) -> None:
+    for _ in range(cycles):
+        time_cycle(arm, start(), busy)
+    if not arm.control.machine.state.is_powered:
+        machine = arm.control.machine
+        raise RuntimeError(f"the arm tripped: {machine.state.name}, {machine.fault.name}")
+
+
+def _time_cpu(arm: Arm, start_ns: int, busy: Busy) -> None:
+    cpu_ns = thread_time_ns()
+    arm.step(start_ns)
+    busy.cpu.append((thread_time_ns() - cpu_ns) * 1e-3)
+
+
+def _time_wall(arm: Arm, start_ns: int, busy: Busy) -> None:
+    arm.bus.waited_ns = 0
+    wall_ns = perf_counter_ns()
+    arm.step(start_ns)
+    elapsed_ns = perf_counter_ns() - wall_ns
+    busy.wall.append((elapsed_ns - arm.bus.waited_ns) * 1e-3)
+    busy.waiting.append(arm.bus.waited_ns * 1e-3)
