@@ -51,7 +51,7 @@ class Busy:
 class Arm:
     """The controller's side of the unix bus, tracking scenario A.
 
-    The trajectory starts again when it is over.
+    The trajectory begins anew when it is over.
     """
 
     def __init__(self, config: Config, *, is_whole_body: bool) -> None:
@@ -78,10 +78,7 @@ class Arm:
         for _ in range(ENABLE_CYCLES):
             self.step(now_ns())
             if self.control.machine.state is State.READY:
-                break
-        motion = rig.reference(self.config, self.control.player.setpoint.q_rad)
-        self._rows = memoryview(motion.rows().tobytes()).cast("d")
-        self._samples = motion.samples
+                return
 
     def step(self, start_ns: int) -> None:
         """One cycle: `Control.step` alone, or everything the loop process does in it."""
@@ -92,9 +89,11 @@ class Arm:
         self._loop._cycle += 1
 
     def restart(self) -> None:
-        """Begin the trajectory anew, between two measured blocks."""
+        """Compile and begin the trajectory anew if it is over, between two measured blocks."""
         if not self.control.player.is_moving:
-            self.control.start(self._rows, self._samples, at_index=None)
+            motion = rig.reference(self.config, self.control.player.setpoint.q_rad)
+            rows = memoryview(motion.rows().tobytes()).cast("d")
+            self.control.start(rows, motion.samples, at_index=None)
 
     def close(self) -> None:
         self.control.estop()

@@ -33,9 +33,10 @@ def configuration(bus: str | None = None, **over: object) -> Config:
 
 
 def reference(config: Config, q_rad: list[float]) -> Reference:
-    """Compile scenario A's trajectory from a pose at rest."""
+    """Compile scenario A's trajectory, approached smoothly, from a pose at rest."""
     limits = MotionLimits.of(config.controller.limits, config.trajectory.max_duration_s)
-    request = scenario_request(find_scenario(SCENARIO))
+    scenario = scenario_request(find_scenario(SCENARIO))
+    request = scenario.model_copy(update={"approach": "blend"})
     return plan(request, MotionState.at_rest(q_rad), limits, config.loop.period_s)
 
 

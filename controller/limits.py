@@ -80,7 +80,7 @@ class MotionGuard:
                 zip(
                     settings.q_min_rad,
                     settings.q_max_rad,
-                    settings.dq_max_rad_s,
+                    settings.dq_trip_rad_s,
                     settings.following_error_rad,
                     strict=True,
                 )

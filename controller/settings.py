@@ -79,7 +79,8 @@ class LimitSettings(_Settings):
     q_min_rad: Joints = Field(description="soft limit: a trajectory may not pass it")
     q_max_rad: Joints
     hard_margin_rad: float = Field(0.1, gt=0, description="the hard limit lies this far beyond")
-    dq_max_rad_s: Joints
+    dq_max_rad_s: Joints = Field(description="of trajectories")
+    dq_trip_rad_s: Joints = Field(description="a joint measured to be faster takes torque off")
     ddq_max_rad_s2: Joints
     dddq_max_rad_s3: Joints
     tau_max_Nm: Joints

@@ -175,9 +175,10 @@ def preset_defaults(name: str) -> dict[str, Any]:
     limits = {
         "q_min_rad": [-2.8] * n,
         "q_max_rad": [2.8] * n,
-        "dq_max_rad_s": [15.0] * n,
-        "ddq_max_rad_s2": [60.0] * n,
-        "dddq_max_rad_s3": [2000.0] * n,
+        "dq_max_rad_s": [4.0] * n,
+        "dq_trip_rad_s": [15.0] * n,
+        "ddq_max_rad_s2": [20.0] * n,
+        "dddq_max_rad_s3": [500.0] * n,
         "tau_max_Nm": tau_max,
         "tau_slew_Nm_s": [500.0 * tau for tau in tau_max],
         "following_error_rad": [0.8] * n,

@@ -5,14 +5,14 @@ import os
 import platform
 import resource
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from drivers.bus import open_bus, split_address
 from drivers.errors import DriverError
-from drivers.frame import worst_case_bits
+from hil.budget import bus_load
 from hil.config import Config
 
 Level = Literal["pass", "warn", "fail"]
@@ -141,21 +141,11 @@ def _bus(config: Config) -> Finding:
 
 
 def _bus_load(config: Config) -> Finding:
-    bits = sum(bits for _, bits in cycle_frames(config))
-    budget = config.bus.bit_rate * config.loop.period_s
-    share = bits / budget
-    found = f"worst case {bits} of {budget:.0f} bits a cycle, {100 * share:.1f} %"
+    bits, share = bus_load(config)
+    found = f"worst case {bits} bits a cycle, {100 * share:.1f} % of the period"
     if share > 0.9:
         return Finding("bus load", "fail", found, "fewer axes, a longer period or a faster bus")
     return Finding("bus load", "pass" if share < 0.75 else "warn", found)
-
-
-def cycle_frames(config: Config) -> Iterator[tuple[str, int]]:
-    """Yield every frame of one cycle and its worst-case length in bits, stuffing included."""
-    yield "SYNC", worst_case_bits(0)
-    for joint in range(1, config.joints + 1):
-        yield f"joint {joint} RPDO1", worst_case_bits(4)
-        yield f"joint {joint} TPDO1", worst_case_bits(8)
 
 
 def _zenoh(config: Config) -> Finding:

@@ -1,12 +1,13 @@
 """Shared memory between the loop and the processes around it: lock-free, one writer per part.
 
-One memory file (memfd) holds the configuration, four rings, the trajectory slots and a few
+One memory file (memfd) holds the configuration, five rings, the trajectory slots and a few
 counters. Nobody ever waits for anybody: a writer that laps a reader is noticed by the reader as
 lost records. The file has no name, so that nothing is left behind however the processes end.
 
 Ordering: every record carries its sequence number before and after its payload, written in that
-order by single aligned stores. That suffices where stores are not reordered with older stores
-(x86-64); elsewhere a torn record shows up as a payload that its reader refuses.
+order by single aligned stores (a typed memoryview; `struct.pack_into` would let readers see the
+zeros it writes first). That suffices where stores are not reordered with older stores (x86-64);
+elsewhere a torn record shows up as a payload that its reader refuses.
 """
 
 import json
@@ -14,20 +15,23 @@ import mmap
 import os
 import struct
 from collections.abc import Mapping
+from time import clock_gettime_ns
 from typing import Any, Final, Self
 
 from hil.config import Config, config_from_json
 from hil.telemetry import BusFrameLayout, SampleLayout
 
 _U64 = struct.Struct("<Q")
-_HEAD = struct.Struct("<QQ")  # sequence number + 1, payload length
-_TAIL_SIZE = 8
+_HEAD_WORDS = 2  # sequence number + 1, payload length
+_TAIL_WORDS = 1  # sequence number + 1
 _CONFIG_SIZE = 64 << 10
 _EVENT_BYTES = 2048
+_STATUS_BYTES = 8192
+_CLOCK_MONOTONIC = 1
 STATUS_EVERY_S: Final = 0.1
 """Period of the loop's status."""
-FRAMES_AT_ONCE: Final = 32
-"""Bus frames in one record at the most; a cycle with more writes several records."""
+RING_S: Final = 8.0
+"""How far back the samples and bus frames reach."""
 SLOTS: Final = 3
 """Trajectory slots: one being played, one waiting, one being written."""
 
@@ -39,37 +43,41 @@ class Ring:
     a restarted reader goes on where its predecessor ended.
     """
 
+    __slots__ = ("_at", "_next", "_payload_size", "_slot_words", "_words", "memory", "slots")
+
     def __init__(self, memory: memoryview, payload_size: int, slots: int) -> None:
         self.memory = memory
         self.slots = slots
-        self.slot_size = _HEAD.size + (payload_size + 7) // 8 * 8 + _TAIL_SIZE
+        self._words = memory.cast("Q")
+        self._slot_words = _slot_words(payload_size)
         self._payload_size = payload_size
-        self._next: int = _U64.unpack_from(memory, 0)[0]
-        self._offset = 0
+        self._next: int = self._words[0]
+        self._at = 0
 
     @staticmethod
     def size(payload_size: int, slots: int) -> int:
         """Bytes of memory a ring needs."""
-        return 8 + slots * (_HEAD.size + (payload_size + 7) // 8 * 8 + _TAIL_SIZE)
+        return 8 * (1 + slots * _slot_words(payload_size))
 
     @property
     def head(self) -> int:
         """Number of records written so far."""
-        count: int = _U64.unpack_from(self.memory, 0)[0]
-        return count
+        return self._words[0]
 
     def begin(self, length: int) -> int:
         """Start a record of `length` bytes and return the offset at which to write it."""
-        self._offset = 8 + self._next % self.slots * self.slot_size
-        _HEAD.pack_into(self.memory, self._offset, self._next + 1, length)
-        return self._offset + _HEAD.size
+        number, words = self._next, self._words
+        at = self._at = 1 + number % self.slots * self._slot_words
+        words[at] = number + 1
+        words[at + 1] = length
+        return 8 * (at + _HEAD_WORDS)
 
     def commit(self) -> None:
         """Publish the record begun last."""
-        self._next += 1
-        memory = self.memory
-        _U64.pack_into(memory, self._offset + self.slot_size - _TAIL_SIZE, self._next)
-        _U64.pack_into(memory, 0, self._next)
+        self._next = number = self._next + 1
+        words = self._words
+        words[self._at + self._slot_words - _TAIL_WORDS] = number
+        words[0] = number
 
     def append(self, payload: bytes) -> None:
         """Publish one record; longer ones than the ring was made for are cut."""
@@ -80,44 +88,76 @@ class Ring:
 
     def get(self, number: int) -> bytes | None:
         """Return record `number`, None if it has been overwritten (or is not written yet)."""
-        offset = 8 + number % self.slots * self.slot_size
-        tail_at = offset + self.slot_size - _TAIL_SIZE
-        if _U64.unpack_from(self.memory, tail_at)[0] != number + 1:
+        words, at = self._words, 1 + number % self.slots * self._slot_words
+        if words[at + self._slot_words - _TAIL_WORDS] != number + 1:
             return None
-        length = min(_HEAD.unpack_from(self.memory, offset)[1], self._payload_size)
-        at = offset + _HEAD.size
-        payload = bytes(self.memory[at : at + length])
-        if _U64.unpack_from(self.memory, offset)[0] != number + 1:
-            return None
-        return payload
+        length = min(words[at + 1], self._payload_size)
+        start = 8 * (at + _HEAD_WORDS)
+        payload = bytes(self.memory[start : start + length])
+        return payload if words[at] == number + 1 else None
+
+    def last(self) -> bytes | None:
+        """Return the newest record, None before the first."""
+        head = self.head
+        record = None
+        while head and record is None:  # a writer that is faster than this: look again
+            record = self.get(head - 1)
+            head = self.head
+        return record
+
+
+def _slot_words(payload_size: int) -> int:
+    return _HEAD_WORDS + (payload_size + 7) // 8 + _TAIL_WORDS
 
 
 class RingReader:
-    """One reader's place in a ring. `lost` counts records that were overwritten unread."""
+    """One reader's place in a ring.
+
+    The place is remembered for a successor only when `commit` says that what was read is dealt
+    with: after a kill, records are read twice rather than never.
+
+    Attributes:
+        place: Number of the next record.
+        lost: Records that were overwritten unread.
+    """
+
+    __slots__ = ("_cursor", "_ring", "lost", "place")
 
     def __init__(self, ring: Ring, cursor: memoryview) -> None:
         self._ring = ring
-        self._cursor = cursor
+        self._cursor = cursor.cast("Q")
+        self.place: int = self._cursor[0]
         self.lost = 0
+
+    @property
+    def backlog(self) -> int:
+        """Records written and not read."""
+        return self._ring.head - self.place
 
     def read(self, most: int) -> list[bytes]:
         """Return up to `most` new records, oldest first, and move on."""
-        place: int = _U64.unpack_from(self._cursor, 0)[0]
-        head = self._ring.head
-        if head - place > self._ring.slots:
-            self.lost += head - self._ring.slots - place
-            place = head - self._ring.slots
+        ring, place = self._ring, self.place
+        head = ring.head
+        if head == place:
+            return []
+        if head - place > ring.slots:
+            self.lost += head - ring.slots - place
+            place = head - ring.slots
         records = []
         end = min(head, place + most)
         while place < end:
-            record = self._ring.get(place)
+            record = ring.get(place)
             place += 1
             if record is None:
                 self.lost += 1
             else:
                 records.append(record)
-        _U64.pack_into(self._cursor, 0, place)
+        self.place = place
         return records
+
+    def commit(self) -> None:
+        """Note that everything read so far is dealt with."""
+        self._cursor[0] = self.place
 
 
 class SharedMemory:

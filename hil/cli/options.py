@@ -1,6 +1,7 @@
 """Options that several verbs share, and the configuration they lead to."""
 
 import argparse
+import os
 from typing import Any
 
 from hil.client import DEFAULT_ENDPOINT
@@ -50,10 +51,11 @@ def add_connection(parser: argparse.ArgumentParser) -> None:
         "--connect",
         action="append",
         metavar="ENDPOINT",
-        help=f"Zenoh endpoint of the daemon or a router (default: {DEFAULT_ENDPOINT})",
+        help=f"Zenoh endpoint of the daemon or a router (default: $HIL_CONNECT, "
+        f"or {DEFAULT_ENDPOINT})",
     )
 
 
 def endpoints(options: argparse.Namespace) -> list[str]:
     """Return the endpoints to connect to."""
-    return options.connect or [DEFAULT_ENDPOINT]
+    return options.connect or [os.environ.get("HIL_CONNECT", DEFAULT_ENDPOINT)]

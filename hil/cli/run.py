@@ -4,6 +4,7 @@ import argparse
 import time
 from pathlib import Path
 
+from hil.budget import require_fit
 from hil.cli.options import add_configuration, configuration
 from hil.config import Config
 from hil.recording import RecordingError
@@ -22,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the daemon until SIGINT or SIGTERM; torque is off at the end."""
     config = configuration(options)
+    require_fit(config)
     recording = recording_path(config, options)
     with sole_daemon(config.arm.name):
         supervisor = Supervisor(config, recording)
