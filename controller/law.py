@@ -1,9 +1,11 @@
 """The paper's control law: an error manifold with integral action, and one gain per joint."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
 from controller.gain import ConstantGain, Gain, SelfTuningGain
+from controller.player import Setpoint
 from controller.settings import LawSettings
 
 HALF_PI = math.pi / 2.0
@@ -25,18 +27,52 @@ MANIFOLDS: dict[str, Callable[[float], float]] = {
 """f of sigma' = f(lambda S_q), paper (8) and section 6.5: bounded by one, increasing, odd."""
 
 
-class PassivityLaw:
+class Law(ABC):
+    """A control law of one arm, stepped once a cycle.
+
+    Attributes:
+        S: Error manifold of the last step, rad/s, per joint.
+        sigma: Its integral term, per joint; zeros where the law has none.
+        Kd: Gain of the last step, Nm s/rad, per joint.
+        gains: The gain of each joint; its bounds can be moved.
+    """
+
+    S: list[float]
+    sigma: list[float]
+    Kd: list[float]
+    gains: list[Gain]
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget what was integrated (power comes on: nothing of an earlier run acts)."""
+
+    @abstractmethod
+    def step(
+        self,
+        q_rad: Sequence[float],
+        dq_rad_s: Sequence[float],
+        setpoint: Setpoint,
+        dt_s: float,
+    ) -> list[float]:
+        """Compute the requested joint torques of one cycle.
+
+        Args:
+            q_rad: Measured joint angles.
+            dq_rad_s: Estimated joint rates.
+            setpoint: Desired angles, rates and accelerations.
+            dt_s: Time since the last step: one period, or more after skipped ones.
+
+        Returns:
+            Torques in Nm, positive about each joint's axis, not yet limited.
+        """
+
+
+class PassivityLaw(Law):
     """tau = -Kd S with S = S_q + Ki sigma, S_q = dq_err + alpha q_err, sigma' = f(lambda S_q).
 
     Paper (6), (7), (8), (11) with a constant gain, (16) with a self-tuning one; without the
     integral term it is the PD of section 6.4. sigma is integrated by forward Euler after use, and
     waits while the torque is saturated and S_q would push it further (anti-windup).
-
-    Attributes:
-        S: Extended error manifold of the last step, rad/s, per joint.
-        sigma: Integral term used in the last step, per joint.
-        Kd: Gain of the last step, Nm s/rad, per joint.
-        gains: The gain of each joint; its bounds can be moved.
     """
 
     __slots__ = (
@@ -65,29 +101,18 @@ class PassivityLaw:
         self.Kd = [gain.Kd_max for gain in self.gains]
 
     def reset(self) -> None:
-        """Forget the integral term (used when power comes on: nothing of an earlier run acts)."""
+        """Set the integral term to zero."""
         self._next_sigma = [0.0] * len(self._next_sigma)
 
     def step(
         self,
         q_rad: Sequence[float],
         dq_rad_s: Sequence[float],
-        q_des_rad: Sequence[float],
-        dq_des_rad_s: Sequence[float],
+        setpoint: Setpoint,
         dt_s: float,
     ) -> list[float]:
-        """Compute the requested joint torques of one cycle.
-
-        Args:
-            q_rad: Measured joint angles.
-            dq_rad_s: Estimated joint rates.
-            q_des_rad: Desired angles.
-            dq_des_rad_s: Desired rates.
-            dt_s: Time since the last step: one period, or more after skipped ones.
-
-        Returns:
-            Torques in Nm, positive about each joint's axis, not yet limited.
-        """
+        """See `Law.step`; the desired acceleration is not used."""
+        q_des_rad, dq_des_rad_s, _ = setpoint
         S, sigma, Kd, tau = [], [], [], []
         f = self._f
         for j, (alpha, Ki) in enumerate(self._alpha):

@@ -175,8 +175,7 @@ class Control:
         if code is not FaultCode.NONE:
             self._trip(code, **self._explain(code))
             return self._damp() if self.machine.state is State.STOPPING else self._rest()
-        q_des, dq_des, _ = setpoint
-        self.tau_cmd_Nm = self.law.step(self.q_rad, self.dq_rad_s, q_des, dq_des, dt_s)
+        self.tau_cmd_Nm = self.law.step(self.q_rad, self.dq_rad_s, setpoint, dt_s)
         try:
             return self._limiter.step(self.tau_cmd_Nm, dt_s)
         except CommandError as error:

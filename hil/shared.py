@@ -32,6 +32,8 @@ STATUS_EVERY_S: Final = 0.1
 """Period of the loop's status."""
 RING_S: Final = 8.0
 """How far back the samples and bus frames reach."""
+FRAMES_AT_ONCE: Final = 16
+"""Bus frames in one record, at most."""
 SLOTS: Final = 3
 """Trajectory slots: one being played, one waiting, one being written."""
 
@@ -155,6 +157,16 @@ class RingReader:
         self.place = place
         return records
 
+    def read_json(self, most: int) -> list[dict[str, Any]]:
+        """Return up to `most` new JSON objects; a record that is none (cut, torn) counts as lost."""
+        objects = []
+        for record in self.read(most):
+            try:
+                objects.append(json.loads(record))
+            except ValueError:
+                self.lost += 1
+        return objects
+
     def commit(self) -> None:
         """Note that everything read so far is dealt with."""
         self._cursor[0] = self.place
@@ -177,7 +189,7 @@ class SharedMemory:
         self.fd = fd
         self._map = mmap.mmap(fd, 0)
         self._memory = memoryview(self._map)
-        (length,) = _U64.unpack_from(self._memory, 0)
+        length = self._memory[:8].cast("Q")[0]
         self.config: Config = config_from_json(bytes(self._memory[8 : 8 + length]))
         self.layout = SampleLayout(self.config.joints, with_truth=False)
         self.frame_layout = BusFrameLayout()
@@ -187,8 +199,8 @@ class SharedMemory:
         self.events = self._ring("events")
         self.commands = self._ring("commands")
         self._status = self._ring("status")
-        self._estop = self._view("estop")
-        self._beats = {who: self._view(f"{who}.beat") for who in ("gateway", "loop")}
+        self._estop = self._view("estop").cast("Q")
+        self._beats = {who: self._view(f"{who}.beat").cast("Q") for who in ("gateway", "loop")}
 
     @classmethod
     def create(cls, config: Config) -> Self:
@@ -205,6 +217,14 @@ class SharedMemory:
         """Return the reader of ring `part` for `who`: `loop`, `gateway` or `recorder`."""
         return RingReader(getattr(self, part), self._view(f"{who}.{part}"))
 
+    def follower(self, part: str) -> RingReader:
+        """Return a reader of what ring `part` gets from now on; its place is its own."""
+        ring: Ring = getattr(self, part)
+        cursor = bytearray(8)
+        reader = RingReader(ring, memoryview(cursor))
+        reader.place = ring.head
+        return reader
+
     def rows(self, slot: int) -> "memoryview[float]":
         """Return the flat doubles of a trajectory slot."""
         return self.slot(slot).cast("d")
@@ -217,22 +237,25 @@ class SharedMemory:
 
     def beat(self, who: str, t_ns: int) -> None:
         """Note that `who` (`gateway`, `loop`) is alive at `t_ns` (CLOCK_MONOTONIC)."""
-        _U64.pack_into(self._beats[who], 0, t_ns)
+        self._beats[who][0] = t_ns
 
     def last_beat(self, who: str) -> int:
         """Return when `who` was last alive, 0 if never."""
-        t_ns: int = _U64.unpack_from(self._beats[who], 0)[0]
-        return t_ns
+        return self._beats[who][0]
+
+    def is_alive(self, who: str, within_s: float) -> bool:
+        """Tell whether `who` was alive within the last so many seconds."""
+        beat_ns = self._beats[who][0]
+        return beat_ns > 0 and clock_gettime_ns(_CLOCK_MONOTONIC) - beat_ns < within_s * 1e9
 
     def request_estop(self) -> None:
         """Ask for an emergency stop, past every queue."""
-        _U64.pack_into(self._estop, 0, self.estop_requests + 1)
+        self._estop[0] = (self._estop[0] + 1) & 0xFFFF_FFFF
 
     @property
     def estop_requests(self) -> int:
         """Number of emergency stops asked for so far."""
-        count: int = _U64.unpack_from(self._estop, 0)[0]
-        return count
+        return self._estop[0]
 
     def post_status(self, status: Mapping[str, Any]) -> None:
         """Publish the loop's status; the last one counts."""
@@ -240,8 +263,7 @@ class SharedMemory:
 
     def status(self) -> dict[str, Any]:
         """Return the last status, empty before the first."""
-        head = self._status.head
-        record = self._status.get(head - 1) if head else None
+        record = self._status.last()
         status: dict[str, Any] = json.loads(record) if record else {}
         return status
 
@@ -258,14 +280,13 @@ def _plan(config: Config, sample_size: int, frame_size: int) -> dict[str, tuple[
     """Place every part: name -> (start, size[, payload size, slots]); `end` is the total."""
     n, period_s = config.joints, config.loop.period_s
     rows = round(config.trajectory.max_duration_s / period_s) + 1
-    ring_s = 8.0
-    cycles = round(ring_s / period_s)
+    cycles = round(RING_S / period_s)
     rings = {
         "samples": (sample_size, cycles),
         "frames": (frame_size * FRAMES_AT_ONCE, cycles),
         "events": (_EVENT_BYTES, 512),
         "commands": (_EVENT_BYTES, 64),
-        "status": (_EVENT_BYTES, 2),
+        "status": (_STATUS_BYTES, 4),
     }
     words = ["estop", "gateway.beat", "loop.beat", "loop.commands"]
     words += [f"{who}.{part}" for who in ("gateway", "recorder") for part in ("samples", "events")]
