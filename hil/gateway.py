@@ -3,6 +3,9 @@
 Keys under `hil/<arm>/`: streams `telemetry` (Protobuf `hil.v1.SampleBatch`, every cycle), `status`
 (JSON, 10 Hz), `event` (JSON); queryables `cmd/<command>`, `schema`, `config`; liveliness token
 `alive`.
+
+Threads: the main one says that the gateway is alive, one streams (a subscriber that does not keep
+up can block it), one answers requests, and one those that end a motion, which wait for no other.
 """
 
 import json
@@ -10,25 +13,23 @@ import queue
 import signal
 import sys
 import threading
-from collections import deque
+from collections.abc import Callable
 from time import sleep
 
-import numpy as np
 import zenoh
 
-from controller.machine import State
-from hil.dispatch import Dispatcher, Present
+from hil.dispatch import URGENT, Dispatcher
 from hil.errors import HilError
 from hil.messages import schemas
+from hil.process import outlast_loop
 from hil.realtime import die_with_parent, now_ns
 from hil.session import open_session
-from hil.shared import STATUS_EVERY_S, SharedMemory
+from hil.shared import SharedMemory
+from hil.streams import Streams
 
-STREAM_EVERY_S = 0.01
-BATCH_SAMPLES = 1000
-EVENTS_AT_ONCE = 100
-WINDOW_S = 10.0
-"""Lateness and busy time in `status` are over this many seconds."""
+BEAT_EVERY_S = 0.02
+
+_Queue = queue.SimpleQueue[zenoh.Query]
 
 
 class Gateway:
@@ -39,56 +40,38 @@ class Gateway:
         self._session = session
         self._prefix = f"hil/{shared.config.arm.name}"
         self._dispatcher = Dispatcher(shared)
-        self._requests: queue.SimpleQueue[zenoh.Query] = queue.SimpleQueue()
-        self._samples = shared.reader("samples", "gateway")
-        self._events = shared.reader("events", "gateway")
-        self._is_ended = threading.Event()
-        self._published = 0
-        window = round(WINDOW_S / shared.config.loop.period_s)
-        self._late_ns: deque[int] = deque(maxlen=window)
-        self._busy_ns: deque[int] = deque(maxlen=window)
-        reliable = zenoh.CongestionControl.BLOCK
-        self._telemetry = self._publisher(
-            "telemetry", zenoh.Encoding.APPLICATION_PROTOBUF, reliable
-        )
-        self._event = self._publisher("event", zenoh.Encoding.APPLICATION_JSON, reliable)
-        self._status = self._publisher(
-            "status", zenoh.Encoding.APPLICATION_JSON, zenoh.CongestionControl.DROP
-        )
+        self._streams = Streams(shared, session)
+        self._requests: _Queue = queue.SimpleQueue()
+        self._urgent: _Queue = queue.SimpleQueue()
+        self._signals: list[int] = []
 
-    def _publisher(
-        self, name: str, encoding: zenoh.Encoding, congestion: zenoh.CongestionControl
-    ) -> zenoh.Publisher:
-        return self._session.declare_publisher(
-            f"{self._prefix}/{name}", encoding=encoding, congestion_control=congestion
-        )
-
-    def run(self) -> None:
-        """Serve until SIGTERM."""
-        signal.signal(signal.SIGTERM, lambda *_: self._is_ended.set())
+    def run(self, parent_pid: int) -> None:
+        """Serve until SIGTERM; without supervisor, until the loop has ended."""
+        signal.signal(signal.SIGTERM, lambda number, _: self._signals.append(number))
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor decides
-        worker = threading.Thread(target=self._serve_requests, daemon=True)
-        worker.start()
+        streaming = self._start(self._streams.run, self._signals)
+        threads = [streaming, self._start(self._serve, self._requests)]
+        threads.append(self._start(self._serve, self._urgent))
         held = self._declare()
-        every = round(STATUS_EVERY_S / STREAM_EVERY_S)
-        turn = 0
-        while not self._is_ended.is_set():
+        while not self._signals and all(thread.is_alive() for thread in threads):
             self._shared.beat("gateway", now_ns())
-            self._stream_samples()
-            self._stream_events()
-            if turn % every == 0:
-                self._publish_status()
-            turn += 1
-            sleep(STREAM_EVERY_S)
-        self._stream_samples()
-        self._stream_events()
-        self._publish_status()
+            sleep(BEAT_EVERY_S)
+        streaming.join()
+        outlast_loop(self._shared, parent_pid, self._streams.turn)
+        self._streams.turn()
+        self._streams.publish_status()
         del held
+
+    @staticmethod
+    def _start(work: Callable[..., None], argument: object) -> threading.Thread:
+        thread = threading.Thread(target=work, args=(argument,), daemon=True)
+        thread.start()
+        return thread
 
     def _declare(self) -> list[object]:
         session, prefix = self._session, self._prefix
         return [
-            session.declare_queryable(f"{prefix}/cmd/*", self._requests.put),
+            session.declare_queryable(f"{prefix}/cmd/*", self._sort),
             session.declare_queryable(f"{prefix}/schema", lambda q: _reply(q, schemas())),
             session.declare_queryable(
                 f"{prefix}/config", lambda q: _reply(q, self._shared.config.model_dump(mode="json"))
@@ -96,62 +79,33 @@ class Gateway:
             session.liveliness().declare_token(f"{prefix}/alive"),
         ]
 
-    # --- streams -----------------------------------------------------------------------------
+    def _sort(self, query: zenoh.Query) -> None:
+        """Queue a request; an emergency stop is passed on at once, before it is answered."""
+        verb = _verb(query)
+        self._dispatcher.forestall(verb, _payload(query))
+        (self._urgent if verb in URGENT else self._requests).put(query)
 
-    def _stream_samples(self) -> None:
-        layout = self._shared.layout
-        while records := self._samples.read(BATCH_SAMPLES):
-            self._telemetry.put(layout.batch(records))
-            self._published += len(records)
-            rows = layout.decode(records)
-            self._late_ns.extend(rows["wake_late_ns"].tolist())
-            self._busy_ns.extend(rows["busy_ns"].tolist())
-            last = rows[-1]
-            self._dispatcher.present = Present(
-                State(int(last["state"])), float(last["t_ref_s"]), last["q_des_rad"].tolist()
-            )
-
-    def _stream_events(self) -> None:
-        for record in self._events.read(EVENTS_AT_ONCE):
-            event = json.loads(record)
-            if event["kind"] == "command":
-                self._dispatcher.take_outcome(event)
-            self._event.put(record)
-
-    def _publish_status(self) -> None:
-        status = self._shared.status()
-        status["telemetry_published"] = self._published
-        status["telemetry_lost"] = self._samples.lost
-        status["wake_late_us"] = _quantiles_us(self._late_ns)
-        status["busy_us"] = _quantiles_us(self._busy_ns)
-        self._status.put(json.dumps(status))
-
-    # --- requests ----------------------------------------------------------------------------
-
-    def _serve_requests(self) -> None:
+    def _serve(self, requests: _Queue) -> None:
         while True:
-            query = self._requests.get()
+            query = requests.get()
             with query:
-                verb = str(query.key_expr).rpartition("/")[2]
-                payload = bytes(query.payload) if query.payload is not None else b""
-                reply = self._dispatcher.answer(verb, payload)
+                reply = self._dispatcher.answer(_verb(query), _payload(query))
                 _reply(query, reply.model_dump(exclude_none=True))
 
 
+def _verb(query: zenoh.Query) -> str:
+    return str(query.key_expr).rpartition("/")[2]
+
+
+def _payload(query: zenoh.Query) -> bytes:
+    return bytes(query.payload) if query.payload is not None else b""
+
+
 def _reply(query: zenoh.Query, value: object) -> None:
-    query.reply(query.key_expr, json.dumps(value), encoding=zenoh.Encoding.APPLICATION_JSON)
-
-
-def _quantiles_us(values_ns: deque[int]) -> dict[str, float]:
-    if not values_ns:
-        return {}
-    p50, p99, p999, most = np.percentile(values_ns, [50, 99, 99.9, 100]) / 1e3
-    return {
-        "p50": round(p50, 1),
-        "p99": round(p99, 1),
-        "p99.9": round(p999, 1),
-        "max": round(most, 1),
-    }
+    try:
+        query.reply(query.key_expr, json.dumps(value), encoding=zenoh.Encoding.APPLICATION_JSON)
+    except zenoh.ZError as error:  # the client has gone; the others are still there
+        print(f"hil: no reply to {query.key_expr}: {error}", file=sys.stderr)  # noqa: T201
 
 
 def main(shared_fd: int, parent_pid: int) -> int:
@@ -164,7 +118,7 @@ def main(shared_fd: int, parent_pid: int) -> int:
     shared = SharedMemory(shared_fd)
     try:
         with open_session(shared.config.zenoh) as session:
-            Gateway(shared, session).run()
+            Gateway(shared, session).run(parent_pid)
     except HilError as error:
         print(f"hil: {error}", file=sys.stderr)  # noqa: T201 - the line the user is promised
         return 1

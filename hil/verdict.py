@@ -1,20 +1,16 @@
 """What a recorded run shows, in words for a terminal: figures, and for a scenario the verdict."""
 
-from pathlib import Path
-
 from hil.metrics import Metrics, check, format_figure, format_table, measure, measure_scenario
 from hil.recording import Recording
 from hil.scenarios import SCENARIOS
 
 
-def judge(path: Path) -> tuple[str, bool]:
+def judge(recording: Recording) -> tuple[str, bool]:
     """Return the text, and whether every bound of the run's scenario is met (True without one).
 
     Raises:
-        RecordingError: If the file is no recording.
         MetricsError: If no trajectory ran in it.
     """
-    recording = Recording.open(path)
     scenario = SCENARIOS.get(recording.config.get("scenario") or "")
     if scenario is None:
         return _figures(measure(recording.samples)), True

@@ -1,16 +1,33 @@
 """What can be set of the emulated arm and its amplifiers."""
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class _Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+class DrivetrainSettings(_Settings):
+    """A rotor in front of its joint, behind a gap with compliant flanks.
+
+    Everything is seen at the joint: a rotor behind a gear of ratio N counts N**2 times. The rotor
+    turns relative to the previous link and its spin does not load that link otherwise (Spong 1987,
+    "Modeling and Control of Elastic Joint Robots", assumption A2).
+    """
+
+    rotor_inertia_kg_m2: float = Field(gt=0, description="added to the link's own")
+    gap_rad: float = Field(0.0, ge=0, description="whole play: half on either side")
+    stiffness_Nm_rad: float = Field(1e4, gt=0, description="of a flank in contact")
+    damping_Nms_rad: float = Field(1.0, ge=0, description="of a flank in contact; never pulls")
+    viscous_Nms_rad: float = Field(0.0, ge=0, description="of the rotor, before the gap")
+    coulomb_Nm: float = Field(0.0, ge=0, description="of the rotor, before the gap")
+    encoder: Literal["motor", "link"] = Field("motor", description="the side the encoder is on")
+
+
 class LinkSettings(_Settings):
-    """One rigid link and the friction of the joint that carries it."""
+    """One rigid link, and friction, stops and drivetrain of the joint that carries it."""
 
     length_m: float = Field(gt=0)
     com_m: float = Field(gt=0, description="joint to centre of mass")
@@ -18,6 +35,75 @@ class LinkSettings(_Settings):
     inertia_kg_m2: float = Field(gt=0, description="about the centre of mass")
     viscous_Nms_rad: float = Field(0.0, ge=0)
     coulomb_Nm: float = Field(0.0, ge=0)
+    static_Nm: float | None = Field(
+        None,
+        gt=0,
+        description="Cs of the Stribeck curve, at least coulomb_Nm; left out, there is none",
+    )
+    stribeck_rad_s: float = Field(0.1, gt=0, description="vs of the Stribeck curve")
+    q_min_rad: float | None = Field(None, description="lower joint stop; left out, there is none")
+    q_max_rad: float | None = Field(None, description="upper joint stop; left out, there is none")
+    drivetrain: DrivetrainSettings | None = Field(
+        None, description="left out, the motor drives the link directly"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.static_Nm is not None and self.static_Nm < self.coulomb_Nm:
+            raise ValueError(
+                f"static_Nm = {self.static_Nm:g} is below coulomb_Nm = {self.coulomb_Nm:g}:"
+                " static friction is at least Coulomb friction"
+            )
+        if self.q_min_rad is not None and self.q_max_rad is not None:
+            if self.q_min_rad >= self.q_max_rad:
+                raise ValueError(
+                    f"q_min_rad = {self.q_min_rad:g} must be below q_max_rad = {self.q_max_rad:g}"
+                )
+        return self
+
+
+class DisturbanceSettings(_Settings):
+    """A torque about a joint that no motor makes; it reacts on the previous link.
+
+    With a drivetrain it acts on the link. A constant one without end is a load step. A sine starts
+    at zero, upwards.
+    """
+
+    joint: int = Field(ge=1, description="1 is the shoulder")
+    kind: Literal["constant", "sine"] = "constant"
+    torque_Nm: float = Field(description="value, or amplitude of the sine")
+    frequency_Hz: float | None = Field(None, gt=0, description="of the sine")
+    start_s: float = Field(0.0, ge=0, description="since the arm was let go")
+    end_s: float | None = Field(None, description="left out, it lasts")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.frequency_Hz is None) == (self.kind == "sine"):
+            need = "needs" if self.kind == "sine" else "has no"
+            raise ValueError(f"a {self.kind} disturbance {need} frequency_Hz")
+        _require_order("start_s", self.start_s, "end_s", self.end_s)
+        return self
+
+
+class PayloadSettings(_Settings):
+    """An object at the tip of the last link, picked up and dropped at set times."""
+
+    mass_kg: float = Field(gt=0)
+    inertia_kg_m2: float = Field(0.0, ge=0, description="about its own centre, which is the tip")
+    pick_s: float = Field(
+        0.0, ge=0, description="since the arm was let go, to the nearest substep; 0: from the start"
+    )
+    drop_s: float | None = Field(None, description="left out, it is kept")
+    is_at_rest: bool = Field(
+        False,
+        description="the object rests until it is picked up, which jolts the arm; else it moves"
+        " with the hand",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _require_order("pick_s", self.pick_s, "drop_s", self.drop_s)
+        return self
 
 
 class PlantSettings(_Settings):
@@ -36,10 +122,37 @@ class PlantSettings(_Settings):
         True,
         description="the arm stays at its start pose (as on a stand) until a drive is energised",
     )
+    disturbances: tuple[DisturbanceSettings, ...] = Field(
+        (), description="times count while the arm is not held"
+    )
+    payloads: tuple[PayloadSettings, ...] = Field(
+        (), description="times count while the arm is not held"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for number, disturbance in enumerate(self.disturbances, 1):
+            if disturbance.joint > len(self.links):
+                raise ValueError(
+                    f"disturbance {number} acts on joint {disturbance.joint}:"
+                    f" this arm has {len(self.links)}"
+                )
+        for joint, (link, q_rad) in enumerate(zip(self.links, self.q0_rad, strict=False), 1):
+            low, high = link.q_min_rad, link.q_max_rad
+            if (low is not None and q_rad < low) or (high is not None and q_rad > high):
+                raise ValueError(
+                    f"q0_rad of joint {joint} is {q_rad:g}, outside its stops"
+                    f" (q_min_rad = {low}, q_max_rad = {high})"
+                )
+        return self
 
 
 class ServoSettings(_Settings):
-    """Motor winding, current loop and encoder of one axis (direct drive)."""
+    """Motor winding, current loop and encoder of one axis.
+
+    Torque constant and encoder are seen at the joint. Which side of a drivetrain the encoder is on
+    is the plant's to say (`DrivetrainSettings.encoder`).
+    """
 
     torque_constant_Nm_A: float = Field(gt=0)
     resistance_ohm: float = Field(2.0, gt=0)
@@ -68,3 +181,8 @@ class EmulatorSettings(_Settings):
         description="`hil sim` only: no frames, true position and velocity, torque after 0.5 ms "
         "delay and 0.5 ms lag",
     )
+
+
+def _require_order(start: str, start_s: float, end: str, end_s: float | None) -> None:
+    if end_s is not None and end_s <= start_s:
+        raise ValueError(f"{end} = {end_s:g} s must be later than {start} = {start_s:g} s")

@@ -22,10 +22,13 @@ from hil.client import Client
 from hil.errors import HilError
 from hil.experiment import scenario_request
 from hil.fixed_protobuf import Records
+from hil.metrics import Timing, timing
+from hil.recording import Recording
 from hil.report import write_report
 from hil.scenarios import find_scenario
 from hil.verdict import judge
 
+RECORDING = "demo.mcap"
 END_TIMEOUT_S = 15.0
 SETTLE_S = 0.3
 
@@ -48,10 +51,11 @@ def run(options: argparse.Namespace) -> int:
     directory = Path(options.out or f"runs/demo-{stamp}")
     directory.mkdir(parents=True, exist_ok=True)
     outcome = Demo(options, directory).run()
-    text, has_passed = judge(outcome.recording)
-    print(f"\n{outcome.text()}\n\n{text}\n")
-    print(f"recording  {outcome.recording}")
-    print(f"report     {write_report(outcome.recording, directory)}")
+    recording = Recording.open(directory / RECORDING)
+    text, has_passed = judge(recording)
+    print(f"\n{outcome.text(timing(recording.samples))}\n\n{text}\n")
+    print(f"recording  {recording.path}")
+    print(f"report     {write_report(recording.path, directory)}")
     return 0 if has_passed and outcome.is_whole else 1
 
 
@@ -63,7 +67,6 @@ class DemoError(HilError):
 class Outcome:
     """What the processes of a demonstration counted."""
 
-    recording: Path
     status: dict[str, Any]
     received: int
     lost: int
@@ -73,18 +76,17 @@ class Outcome:
         """Nothing was lost between the loop and the subscriber in another process."""
         return self.lost == 0 and self.status["telemetry_lost"] == 0 and self.received > 0
 
-    def text(self) -> str:
-        """Return the counts for a terminal."""
+    def text(self, timing: Timing) -> str:
+        """Return the counts for a terminal, with the timing of the whole run."""
         s = self.status
-        late, busy = s["wake_late_us"], s["busy_us"]
+        late, busy = timing.wake_late_us, timing.busy_us
         rights = "" if not s["realtime_missing"] else f" ({'; '.join(s['realtime_missing'])})"
         mode = "lockstep" if s["is_lockstep"] else "wall clock"
         return (
             f"cycles      {s['samples']} run, {s['overruns']} skipped, {mode}, "
             f"{s['scheduler']}{rights}\n"
-            f"lateness    p50 {late['p50']} us, p99 {late['p99']} us, worst {late['max']} us "
-            "(last 10 s; the report has all)\n"
-            f"busy        p50 {busy['p50']} us, p99 {busy['p99']} us of each 1000 us\n"
+            f"lateness    p50 {late[0]:.0f} us, p99 {late[1]:.0f} us, worst {late[2]:.0f} us\n"
+            f"busy        p50 {busy[0]:.0f} us, p99 {busy[1]:.0f} us of each 1000 us\n"
             f"bus         {s['frames_sent']} frames sent, {s['frames_received']} received, "
             f"{s['send_failures']} not sent, {s['late_frames']} late\n"
             f"telemetry   {s['telemetry_published']} samples published; {self.received} "
@@ -103,7 +105,7 @@ class Demo:
                 f"run it with: hil sim --scenario {self._scenario.name}"
             )
         self._directory = directory
-        self._recording = directory / "demo.mcap"
+        self._recording = directory / RECORDING
         self._port = _free_port()
         self._bus = options.bus
         self._time = options.time
@@ -153,7 +155,7 @@ class Demo:
             daemon.end()  # it publishes its last samples and status before it goes
             sleep(SETTLE_S)
             counted = json.loads(counter.end())
-        return Outcome(self._recording, statuses[-1], counted["received"], counted["lost"])
+        return Outcome(statuses[-1], counted["received"], counted["lost"])
 
     def _follow(self, rows: Records) -> None:
         self._t_ref_s = float(rows["t_ref_s"][-1])

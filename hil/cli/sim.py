@@ -10,6 +10,7 @@ from hil.cli.options import add_configuration, configuration
 from hil.errors import HilError
 from hil.experiment import run_in_simulation, scenario_request
 from hil.messages import TrajectoryRequest, parse_trajectory
+from hil.recording import Recording
 from hil.scenarios import find_scenario
 from hil.verdict import judge
 
@@ -37,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     with tqdm(leave=False, disable=None, bar_format="simulated {n:.0f} s") as bar:
         simulated_s = run_in_simulation(config, request, path, progress=bar.update)
     took_s = perf_counter() - started_s
-    text, has_passed = judge(path)
+    text, has_passed = judge(Recording.open(path))
     print(text)
     print(
         f"simulated {simulated_s:.1f} s in {took_s:.1f} s ({simulated_s / took_s:.1f} x real time)"

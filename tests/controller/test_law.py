@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.law import MANIFOLDS, PassivityLaw
+from controller.player import Setpoint
 from controller.settings import LawSettings
 
 T = 1e-3
@@ -43,11 +44,16 @@ def motion(cycles=600, seed=5):
     return q, dq, q_des, dq_des
 
 
+def stepped(law, q, dq, q_des=(0.0, 0.0), dq_des=(0.0, 0.0), *, dt_s=T):
+    """One cycle of a law; a desired acceleration, of which this law knows nothing, is present."""
+    return law.step(q, dq, Setpoint(list(q_des), list(dq_des), [3.0, -4.0]), dt_s)
+
+
 def played(law, q, dq, q_des, dq_des, dt_s=T):
     """Run a law; return S, sigma, Kd and tau, one row a cycle."""
     rows = []
     for row in zip(q.tolist(), dq.tolist(), q_des.tolist(), dq_des.tolist(), strict=True):
-        tau = law.step(*row, dt_s)
+        tau = stepped(law, *row, dt_s=dt_s)
         rows.append((list(law.S), list(law.sigma), list(law.Kd), tau))
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
@@ -87,9 +93,9 @@ def test_law__random_motion__follows_the_paper(name, manifold):
 def test_law__positive_error__torque_pulls_back(name):
     """Sign of the whole loop: the joint is ahead of its reference, the torque is negative."""
     law = PassivityLaw(LawSettings(name=name, **PAPER), AMPLE_NM)
-    tau = law.step([0.3, -0.3], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], T)
+    tau = stepped(law, [0.3, -0.3], [0.0, 0.0])
     assert tau[0] < 0.0 < tau[1]
-    assert law.S == pytest.approx([1.5, -2.25])
+    assert law.S == pytest.approx([5.0 * 0.3, -7.5 * 0.3])
 
 
 @pytest.mark.parametrize("name", ["pd", "self_tuning_pd"])
@@ -105,10 +111,9 @@ def test_law__pd__has_no_integral(name):
 def test_law__pid__sigma_is_integrated_after_use_with_the_time_that_passed():
     settings = LawSettings(name="pid", **PAPER)
     law = PassivityLaw(settings, AMPLE_NM)
-    step = ([0.02, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0])
     f = math.tanh(10.0 * 5.0 * 0.02)
     for dt_s, sigma in ((T, 0.0), (3 * T, f * T), (T, f * 4 * T)):
-        law.step(*step, dt_s)
+        stepped(law, [0.02, 0.0], [0.0, 0.0], dt_s=dt_s)
         assert law.sigma[0] == pytest.approx(sigma, abs=1e-15)
         assert law.S[0] == pytest.approx(5.0 * 0.02 + 0.2 * sigma, abs=1e-15)
 
@@ -139,7 +144,7 @@ def test_law__reset__keeps_what_the_gain_has_learnt():
 def constant_error(law, S_q, cycles):
     """Hold an error of S_q (by velocity alone) at joint 1; return its sigma of the last cycle."""
     for _ in range(cycles):
-        law.step([0.0, 0.0], [S_q, 0.0], [0.0, 0.0], [0.0, 0.0], T)
+        stepped(law, [0.0, 0.0], [S_q, 0.0])
     return law.sigma[0]
 
 
@@ -172,7 +177,7 @@ def test_law__torque_saturated_but_pulled_back__sigma_unwinds(sign):
 def test_law__one_joint_saturated__the_other_integrates_on():
     law = PassivityLaw(LawSettings(name="pid", **PAPER), (0.1, 1e9))
     for _ in range(3):
-        law.step([0.0, 0.0], [0.5, 0.5], [0.0, 0.0], [0.0, 0.0], T)
+        stepped(law, [0.0, 0.0], [0.5, 0.5])
     assert law.sigma[0] == 0.0
     assert law.sigma[1] == pytest.approx(2 * T * math.tanh(2.0))
 
@@ -208,7 +213,7 @@ def test_law__gain_bounds_moved__torque_follows_the_new_gain():
     for gain in law.gains:
         gain.set_bounds(1.0, 2.0)
     for _ in range(300):
-        tau = law.step([0.0, 0.0], [0.01, 0.0], [0.0, 0.0], [0.0, 0.0], T)
+        tau = stepped(law, [0.0, 0.0], [0.01, 0.0])
     assert law.Kd[0] == pytest.approx(1.0 + (gain_surface(law.S[0]) - 1.0) / 3.0, abs=1e-9)
     assert tau[0] == -law.Kd[0] * law.S[0]
 
@@ -252,9 +257,7 @@ def test_manifold__over_a_grid__slope_between_zero_and_one(name):
     np.testing.assert_allclose(values, F[name](x), rtol=0.0, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("name", "end"), [("tanh", 19.0), ("sine", math.pi / 2), ("saturation", 1)]
-)
+@pytest.mark.parametrize(("name", "end"), [("tanh", 7.0), ("sine", math.pi / 2), ("saturation", 1)])
 def test_manifold__inside_its_range__strictly_increasing(name, end):
     x = np.linspace(-0.999 * end, 0.999 * end, 301)
     values = [MANIFOLDS[name](each) for each in x.tolist()]
