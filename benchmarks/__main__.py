@@ -1,4 +1,4 @@
-"""`python -m benchmarks [NAME ...] [--quick] [--check]`: prints figures and whether targets hold."""
+"""`python -m benchmarks [NAME ...] [--quick] [--check]`: prints figures and targets."""
 
 import argparse
 import os

@@ -28,6 +28,7 @@ from benchmarks.measure import (
 )
 from benchmarks.plain_law import PlainLaw, Vector
 from controller.law import PassivityLaw
+from controller.player import Setpoint
 from controller.settings import LawSettings
 
 JOINTS = (2, 4, 8, 12)
@@ -38,7 +39,7 @@ TURNS = 40
 STEPS = 1_000_000
 GROWTH_MAX_BLOCKS = 100
 BOUNDS = {2: 3.0, 12: 1.0}
-TAU_MAX_NM = 3.0  # low enough that the anti-windup acts in the motion
+TAU_MAX_NM = 1.0  # low enough that the anti-windup acts in the motion
 
 
 def run(scale: float) -> list[Target]:
@@ -52,7 +53,9 @@ def run(scale: float) -> list[Target]:
         cells = [percentile(samples[name], p) for name in ("ours", "numpy") for p in (0.5, 0.99)]
         row(f"{joints} joints (equal within {deviation:.0e})", *map(us, cells), times(ratio))
         if joints in BOUNDS:
-            targets.append(at_least(f"law: numpy over ours, {joints} joints", ratio, BOUNDS[joints]))
+            targets.append(
+                at_least(f"law: numpy over ours, {joints} joints", ratio, BOUNDS[joints])
+            )
     blocks, resident_kB = _growth(round(STEPS * scale))
     row(f"growth over {round(STEPS * scale)} steps", f"{blocks} blocks", f"RSS {resident_kB:+d} kB")
     targets.append(at_most("law: allocated blocks gained", float(blocks), GROWTH_MAX_BLOCKS))
@@ -89,8 +92,15 @@ def _motion(joints: int) -> list[Row]:
     return rows
 
 
-def _as_lists(rows: list[Row]) -> list[tuple[list[float], ...]]:
-    return [tuple(vector.tolist() for vector in row) for row in rows]
+Cycle = tuple[list[float], list[float], Setpoint]
+
+
+def _as_lists(rows: list[Row]) -> list[Cycle]:
+    cycles = []
+    for row_ in rows:
+        q, dq, q_des, dq_des = (vector.tolist() for vector in row_)
+        cycles.append((q, dq, Setpoint(q_des, dq_des, [0.0] * len(q))))
+    return cycles
 
 
 def _compare(joints: int) -> float:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from controller.machine import State
+from controller.player import Setpoint
 from controller.reference import MotionLimits, MotionState, Reference
 from hil.config import Config, load_config, merge
 from hil.experiment import scenario_request, scenario_settings
@@ -38,6 +39,11 @@ def reference(config: Config, q_rad: list[float]) -> Reference:
     scenario = scenario_request(find_scenario(SCENARIO))
     request = scenario.model_copy(update={"approach": "blend"})
     return plan(request, MotionState.at_rest(q_rad), limits, config.loop.period_s)
+
+
+def setpoint(q_rad: list[float], dq_rad_s: list[float]) -> Setpoint:
+    """Return a reference without acceleration."""
+    return Setpoint(q_rad, dq_rad_s, [0.0] * len(q_rad))
 
 
 def tracking_simulation(config: Config, recording: RecordingWriter | None = None) -> Simulation:

@@ -1,23 +1,12 @@
 """The gain of tau = -Kd S: constant, or tuned by the paper's neuro-fuzzy network (section 4)."""
 
-import math
 from abc import ABC, abstractmethod
 
+from controller.membership import BIG, MEDIUM, MEMBERSHIPS, SMALL
+from controller.membership import sigmoid as memberships
 from controller.settings import LawSettings
 
-BIG, MEDIUM, SMALL = 0, 1, 2
-
-
-def memberships(S_abs: float) -> tuple[float, float, float]:
-    """Degrees to which |S| is (big, medium, small): a partition of unity by two sigmoids.
-
-    Reading of figs 6 and 7: small ends near 0.2 rad/s, big begins near 0.6 rad/s. A plain sum
-    (17) of consequences then stays between the smallest and the largest beta.
-    """
-    a = 1.0 / (1.0 + math.exp((0.20 - S_abs) / 0.04)) if S_abs < 20.0 else 1.0
-    b = 1.0 / (1.0 + math.exp((0.60 - S_abs) / 0.12)) if S_abs < 20.0 else 1.0
-    medium = a - b
-    return b, medium if medium > 0.0 else 0.0, 1.0 - a
+__all__ = ["ConstantGain", "Gain", "SelfTuningGain", "memberships"]
 
 
 class Gain(ABC):
@@ -73,6 +62,7 @@ class ConstantGain(Gain):
 class SelfTuningGain(Gain):
     """Kd_hat = sum_i beta_i mu_i(|S|) (17), beta adapted by a reading of (28).
 
+    mu are the memberships named in the settings (`controller.membership`).
     Adaptations, per 1 ms, with mu of the previous cycle and S of this one:
     `literal`: beta -= rate S alpha mu, as printed (not mirror-symmetric);
     `absolute`: beta -= rate |S| alpha mu; `true_sign`: beta += rate |S| alpha mu, with the sign
@@ -80,7 +70,7 @@ class SelfTuningGain(Gain):
     clipped to it. When the bounds move, each beta keeps its place between them.
     """
 
-    __slots__ = ("_is_absolute", "_mu", "_place", "_rate_per_s", "beta")
+    __slots__ = ("_is_absolute", "_memberships", "_mu", "_place", "_rate_per_s", "beta")
 
     def __init__(self, settings: LawSettings, joint: int) -> None:
         super().__init__(settings.Kd_min[joint], settings.Kd_max[joint], settings.Kd_ramp_per_s)
@@ -88,6 +78,7 @@ class SelfTuningGain(Gain):
         rate = sign[settings.adaptation] * settings.learning_rate * settings.alpha[joint]
         self._rate_per_s = rate / 1e-3
         self._is_absolute = settings.adaptation != "literal"
+        self._memberships = MEMBERSHIPS[settings.membership]
         self._mu = (0.0, 0.0, 0.0)
         self.beta = [self._box(beta) for beta in settings.beta]
         self._place = [0.0, 0.0, 0.0]
@@ -100,7 +91,7 @@ class SelfTuningGain(Gain):
             self.beta = [self.Kd_min + place * span for place in self._place]
         elif self._rate_per_s != 0.0:
             self._adapt(S, dt_s)
-        big, medium, small = self._mu = memberships(S if S >= 0.0 else -S)
+        big, medium, small = self._mu = self._memberships(S if S >= 0.0 else -S)
         beta = self.beta
         Kd = beta[BIG] * big + beta[MEDIUM] * medium + beta[SMALL] * small
         if Kd < self.Kd_min:

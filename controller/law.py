@@ -67,12 +67,20 @@ class Law(ABC):
         """
 
 
+def saturation_limits(settings: LawSettings, tau_max_Nm: Sequence[float]) -> list[float]:
+    """Return the torque beyond which each joint is saturated: its own limit or the law's clip."""
+    if settings.tau_clip_Nm is None:
+        return list(tau_max_Nm)
+    return [min(pair) for pair in zip(tau_max_Nm, settings.tau_clip_Nm, strict=True)]
+
+
 class PassivityLaw(Law):
     """tau = -Kd S with S = S_q + Ki sigma, S_q = dq_err + alpha q_err, sigma' = f(lambda S_q).
 
     Paper (6), (7), (8), (11) with a constant gain, (16) with a self-tuning one; without the
     integral term it is the PD of section 6.4. sigma is integrated by forward Euler after use, and
-    waits while the torque is saturated and S_q would push it further (anti-windup).
+    waits while the torque is saturated and S_q would push it further (anti-windup). The torque is
+    saturated beyond the joint's limit, or beyond `tau_clip_Nm`, to which it is then clipped.
     """
 
     __slots__ = (
@@ -80,6 +88,7 @@ class PassivityLaw(Law):
         "S",
         "_alpha",
         "_f",
+        "_is_clipped",
         "_lambda",
         "_next_sigma",
         "_tau_max_Nm",
@@ -93,7 +102,8 @@ class PassivityLaw(Law):
         self._alpha = [(settings.alpha[j], settings.Ki[j] if is_pid else 0.0) for j in joints]
         self._lambda = list(settings.lambda_)
         self._f = MANIFOLDS[settings.manifold]
-        self._tau_max_Nm = list(tau_max_Nm)
+        self._tau_max_Nm = saturation_limits(settings, tau_max_Nm)
+        self._is_clipped = settings.tau_clip_Nm is not None
         self.gains = [_make_gain(settings, j) for j in joints]
         self.S = [0.0 for _ in joints]
         self.sigma = [0.0 for _ in joints]
@@ -124,6 +134,8 @@ class PassivityLaw(Law):
             is_saturated = abs(tau_j) > self._tau_max_Nm[j]
             if Ki != 0.0 and not (is_saturated and S_q * tau_j < 0.0):
                 self._next_sigma[j] = sigma_j + dt_s * f(self._lambda[j] * S_q)
+            if is_saturated and self._is_clipped:
+                tau_j = math.copysign(self._tau_max_Nm[j], tau_j)
             S.append(S_j)
             sigma.append(sigma_j)
             Kd.append(Kd_j)

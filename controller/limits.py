@@ -102,7 +102,7 @@ class MotionGuard:
             if not math.isfinite(q + dq + error):
                 code, value, limit = FaultCode.NOT_FINITE, q + dq + error, 0.0
             elif not hard_low <= q <= hard_high:
-                code, value, limit = FaultCode.POSITION_HARD, q, hard_high if q > 0 else hard_low
+                code, value, limit = FaultCode.POSITION_HARD, q, hard_high if q > high else hard_low
             elif abs(dq) > dq_max:
                 code, value, limit = FaultCode.VELOCITY, dq, dq_max
             elif not low <= q <= high:

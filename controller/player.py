@@ -3,8 +3,14 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-STOP_SHAPE_PEAK = 1.875
-"""Peak slope of the quintic step in `_speed`, for a step of one over a duration of one."""
+SHORTEST_STOP_PERIODS = 10
+STOP_ROUNDS = 8
+"""Attempts at a stop's duration; the path ahead may be faster than where the stop begins."""
+_STOP_SHAPE = tuple(
+    (x - x**4 * (2.5 - 3.0 * x + x * x), 30.0 * (x * (1.0 - x)) ** 2)
+    for x in (eighth / 8.0 for eighth in range(1, 8))
+)
+"""Way covered and slowing in a stop of duration one from speed one, at seven instants of it."""
 
 
 class Setpoint(NamedTuple):
@@ -75,11 +81,13 @@ class ReferencePlayer:
         """Slow down along the path, so that braking alone stays within these accelerations."""
         if self._rows is None or self.is_stopping:
             return
-        slowest = max(
-            abs(dq) / limit
-            for dq, limit in zip(self.setpoint.dq_rad_s, ddq_max_rad_s2, strict=True)
-        )
-        self._stop_duration_s = max(STOP_SHAPE_PEAK * slowest, 10 * self._period_s)
+        duration_s = SHORTEST_STOP_PERIODS * self._period_s
+        for attempt in range(STOP_ROUNDS):
+            excess = self._braking(duration_s, ddq_max_rad_s2)
+            if excess <= 1.0:
+                break
+            duration_s *= excess * excess if attempt else excess
+        self._stop_duration_s = duration_s
         self._stop_elapsed_s = 0.0
 
     def step(self, periods: int) -> Setpoint:
@@ -98,6 +106,17 @@ class ReferencePlayer:
         if self._phase >= self._last:
             self.hold(self.setpoint.q_rad)
         return self.setpoint
+
+    def _braking(self, duration_s: float, ddq_max_rad_s2: Sequence[float]) -> float:
+        """Return the largest share of its limit that braking takes up in a stop so long."""
+        assert self._rows is not None  # noqa: S101 - only called while a motion is played
+        n, worst = self._joints, 0.0
+        for way, slowing in _STOP_SHAPE:
+            row = min(int(self._phase + way * duration_s / self._period_s), self._last)
+            start = row * 3 * n + n
+            for dq, limit in zip(self._rows[start : start + n], ddq_max_rad_s2, strict=True):
+                worst = max(worst, abs(dq) * slowing / (duration_s * limit))
+        return worst
 
     def _step_stopping(self, periods: int) -> Setpoint:
         dt_s = periods * self._period_s

@@ -6,7 +6,12 @@ from typing import Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Joints = tuple[float, ...]
-LawName = Literal["self_tuning_pid", "self_tuning_pd", "pid", "pd"]
+LawName = Literal[
+    "self_tuning_pid", "self_tuning_pd", "pid", "pd", "computed_torque", "slotine_li"
+]
+MODEL_BASED = ("computed_torque", "slotine_li")
+"""Laws that need `ControllerSettings.model`."""
+MembershipName = Literal["sigmoid", "gaussian_normalised", "gaussian_clipped", "triangular"]
 
 
 class _Settings(BaseModel):
@@ -57,20 +62,82 @@ class LawSettings(_Settings):
     beta: tuple[float, float, float] = Field(
         (1.0, 2.0, 4.0), description="linear consequences of the rules big, medium, small"
     )
+    membership: MembershipName = Field(
+        "sigmoid",
+        description="of the rules; gaussian_clipped lets the plain sum (17) leave the gain bounds",
+    )
     adaptation: Literal["off", "literal", "absolute", "true_sign"] = "literal"
     learning_rate: float = Field(
         1e-6, ge=0, description="eta * Upsilon of (28) per 1 ms; scaled with the period"
     )
+    tau_clip_Nm: Joints | None = Field(
+        None,
+        description="the law's own torque limit per joint, for comparisons at equal peak torque; "
+        "the anti-windup heeds it",
+    )
 
     @model_validator(mode="after")
     def _check_bounds(self) -> Self:
-        for j, (low, high) in enumerate(zip(self.Kd_min, self.Kd_max, strict=True), start=1):
+        for j, clip in enumerate(self.tau_clip_Nm or (), start=1):
+            if not clip > 0.0:
+                raise ValueError(f"joint {j}: tau_clip_Nm {clip:g} must be above 0")
+        for j, (low, high) in enumerate(zip(self.Kd_min, self.Kd_max, strict=False), start=1):
             if not self.Kd_floor <= low <= high <= self.Kd_ceiling:
                 raise ValueError(
                     f"joint {j}: gain bounds ({low:g}, {high:g}) must rise and lie between "
                     f"Kd_floor {self.Kd_floor:g} and Kd_ceiling {self.Kd_ceiling:g}"
                 )
         return self
+
+
+class LinkModel(_Settings):
+    """What the model-based laws take a link, and the friction of its joint, to be."""
+
+    length_m: float = Field(gt=0)
+    com_m: float = Field(ge=0, description="joint to centre of mass")
+    mass_kg: float = Field(ge=0)
+    inertia_kg_m2: float = Field(ge=0, description="about the centre of mass")
+    viscous_Nms_rad: float = Field(0.0, ge=0)
+    coulomb_Nm: float = Field(0.0, ge=0)
+
+
+class ModelSettings(_Settings):
+    """The arm as the model-based laws know it; the other laws do not look at it."""
+
+    links: tuple[LinkModel, ...] = Field(min_length=1, description="from the shoulder outwards")
+    gravity_m_s2: float = Field(0.0, ge=0, description="9.81 for a vertical arm, 0 if horizontal")
+    tanh_slope_s_rad: float = Field(50.0, gt=0, description="D in tau_f = B dq + C tanh(D dq)")
+
+
+class SlotineLiSettings(_Settings):
+    """Adaptation of Theta (paper 3.2.2); per kind of parameter (J, b, B, C, tau_d)."""
+
+    Gamma: tuple[float, float, float, float, float] = Field(
+        (0.05, 0.5, 0.5, 0.5, 0.0),
+        description="Theta' = -Gamma Y_r' S_q; 0 leaves a kind where it starts",
+    )
+    start: Literal["zero", "model"] = Field(
+        "zero", description="Theta at power-on: nothing known, or controller.model"
+    )
+    Theta_max: tuple[float, float, float, float, float] | None = Field(
+        None, description="box: J, b, B, C within 0 .. this, tau_d within +- this"
+    )
+
+    @model_validator(mode="after")
+    def _check_signs(self) -> Self:
+        for name, values in (("Gamma", self.Gamma), ("Theta_max", self.Theta_max or ())):
+            if any(value < 0.0 for value in values):
+                raise ValueError(f"{name} {values} must not be negative")
+        return self
+
+
+class MonitorSettings(_Settings):
+    """How the monitors of S estimate what cannot be measured."""
+
+    demand_cutoff_Hz: float = Field(
+        5.0, gt=0, description="low-pass of the sent torque, the estimate of the required torque"
+    )
+    window_s: float = Field(2.0, gt=0, description="of the ultimate bound of |S|")
 
 
 class LimitSettings(_Settings):
@@ -93,6 +160,21 @@ class LimitSettings(_Settings):
         2.0, gt=0, description="a damped stop ends after this at the latest"
     )
 
+    @model_validator(mode="after")
+    def _check_signs(self) -> Self:
+        for name in ("dq_max_rad_s", "dq_trip_rad_s", "ddq_max_rad_s2", "dddq_max_rad_s3",
+                     "tau_max_Nm", "tau_slew_Nm_s", "following_error_rad"):  # fmt: skip
+            for j, value in enumerate(getattr(self, name), start=1):
+                if not value > 0.0:
+                    raise ValueError(f"joint {j}: {name} {value:g} must be above 0")
+        for j, damping in enumerate(self.damping_Nms_rad, start=1):
+            if damping < 0.0:
+                raise ValueError(f"joint {j}: damping_Nms_rad {damping:g} must not be below 0")
+        for j, (low, high) in enumerate(zip(self.q_min_rad, self.q_max_rad, strict=False), start=1):
+            if not low < high:
+                raise ValueError(f"joint {j}: q_min_rad {low:g} must be below q_max_rad {high:g}")
+        return self
+
 
 class ControllerSettings(_Settings):
     """Law, estimator and limits of one arm."""
@@ -100,6 +182,19 @@ class ControllerSettings(_Settings):
     law: LawSettings = LawSettings()
     velocity: VelocitySettings = VelocitySettings()
     limits: LimitSettings
+    model: ModelSettings | None = Field(None, description="of the arm, for the model-based laws")
+    slotine_li: SlotineLiSettings = SlotineLiSettings()
+    monitor: MonitorSettings = MonitorSettings()
+
+    def warnings(self) -> list[str]:
+        """Say what is allowed and not advised, one line each."""
+        found = []
+        if self.law.membership == "gaussian_clipped" and self.law.name.startswith("self_tuning"):
+            found.append(
+                "controller.law.membership gaussian_clipped: the sum (17) leaves the gain bounds "
+                "and is clipped, and torque falls where |S| grows; use gaussian_normalised"
+            )
+        return found
 
     def require_joints(self, joints: int) -> None:
         """Check that every per-joint list has one entry per joint.
@@ -108,9 +203,20 @@ class ControllerSettings(_Settings):
             ValueError: Naming the list, its length and the number of joints.
         """
         _require_lengths(self.law, ("alpha", "lambda_", "Ki", "Kd", "Kd_min", "Kd_max"), joints)
+        if self.law.tau_clip_Nm is not None:
+            _require_lengths(self.law, ("tau_clip_Nm",), joints)
+        if self.law.name in MODEL_BASED:
+            self._require_model(joints)
         if self.velocity.estimator == "levant":
             _require_lengths(self.velocity, ("C_rad_s2",), joints)
         limits = [
             name for name, value in LimitSettings.model_fields.items() if value.annotation == Joints
         ]
         _require_lengths(self.limits, limits, joints)
+
+    def _require_model(self, joints: int) -> None:
+        if self.model is None:
+            raise ValueError(f"law {self.law.name} needs a model of the arm: controller.model")
+        links = len(self.model.links)
+        if links != joints:
+            raise ValueError(f"model.links has {links} entries, the arm has {joints} joints")

@@ -63,18 +63,18 @@ class Levant(VelocityEstimator):
         self._C = list(settings.C_rad_s2[:joints])
         self._tolerance_rad = settings.lock_tolerance_rad
         self._x0 = [0.0] * joints
-        self._error_rad = 0.0
+        self._is_locked = True
         self.dq_rad_s = [0.0] * joints
 
     def reset(self, q_rad: Sequence[float]) -> None:
         """Start at rest at `q_rad`."""
         self._x0 = list(q_rad)
-        self._error_rad = 0.0
+        self._is_locked = True
         self.dq_rad_s = [0.0] * len(self._x0)
 
     def step(self, q_rad: Sequence[float], dt_s: float) -> list[float]:
         """Take a measurement; see the class."""
-        worst_rad = 0.0
+        is_locked = True
         rates = []
         for j, q in enumerate(q_rad):
             error = self._x0[j] - q
@@ -83,15 +83,15 @@ class Levant(VelocityEstimator):
             C = self._C[j]
             self._x0[j] += dt_s * (x1 - 1.5 * math.sqrt(C * abs(error)) * sign)
             rates.append(x1 - dt_s * 1.1 * C * sign)
-            worst_rad = max(worst_rad, abs(error))
-        self._error_rad = worst_rad
+            is_locked = is_locked and abs(error) <= self._tolerance_rad  # not so for NaN
+        self._is_locked = is_locked
         self.dq_rad_s = rates
         return rates
 
     @property
     def is_locked(self) -> bool:
         """False when a position estimate is further from its measurement than the tolerance."""
-        return self._error_rad <= self._tolerance_rad
+        return self._is_locked
 
 
 def make_estimator(settings: VelocitySettings, joints: int) -> VelocityEstimator:

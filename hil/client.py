@@ -5,7 +5,9 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
 import zenoh
+from numpy.typing import NDArray
 
 from hil.errors import HilError
 from hil.fixed_protobuf import Records
@@ -15,6 +17,10 @@ from hil.telemetry import SampleLayout
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 REPLY_TIMEOUT_S = 15.0
+
+
+REPEATED_NS = 60_000_000_000
+"""Samples older than this are not repeated ones: the daemon's host was restarted."""
 
 
 class NoDaemonError(HilError):
@@ -86,19 +92,27 @@ class Client:
         return schema
 
     def on_telemetry(self, take: Callable[[Records], None]) -> None:
-        """Have every batch of samples passed to `take`, in a thread of Zenoh's.
+        """Have every sample passed to `take` once, in batches, in a thread of Zenoh's.
+
+        A daemon whose gateway was killed and restarted publishes some samples again: these are
+        dropped here.
 
         Args:
             take: Gets one row per cycle; columns are the fields of `hil.v1.Sample`.
         """
         layout: SampleLayout | None = None
+        last_ns = 0
 
         def receive(sample: zenoh.Sample) -> None:
-            nonlocal layout
+            nonlocal layout, last_ns
             payload = bytes(sample.payload)
             if layout is None:
                 layout = SampleLayout.of(payload)
-            take(layout.decode_batch(payload))
+            rows = layout.decode_batch(payload)
+            rows = rows[_is_new(rows, last_ns)]
+            if len(rows):
+                last_ns = int(rows["t_ns"][-1])
+                take(rows)
 
         self._subscribe("telemetry", receive)
 
@@ -137,3 +151,9 @@ class Client:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _is_new(rows: Records, last_ns: int) -> NDArray[np.bool_]:
+    age_ns = last_ns - rows["t_ns"]
+    is_new: NDArray[np.bool_] = (age_ns < 0) | (age_ns > REPEATED_NS)
+    return is_new

@@ -18,7 +18,7 @@ from pydantic_settings import (
     SettingsConfigDict,
 )
 
-from controller.settings import ControllerSettings
+from controller.settings import ControllerSettings, LinkModel, ModelSettings
 from drivers.bus import split_address
 from drivers.errors import DriverError
 from drivers.registry import AnyAxisSettings
@@ -170,6 +170,7 @@ def preset_defaults(name: str) -> dict[str, Any]:
         SimError: If there is no such preset.
     """
     plant, servos = plant_preset(name), servo_preset(name)
+    model = _nominal_model(plant)
     tau_max = [servo.torque_constant_Nm_A * servo.current_max_A for servo in servos]
     n = len(servos)
     limits = {
@@ -196,10 +197,18 @@ def preset_defaults(name: str) -> dict[str, Any]:
     return {
         "arm": {"preset": name},
         "axes": axes,
-        "controller": {"limits": limits},
+        "controller": {"limits": limits, "model": model},
         "plant": plant.model_dump(),
         "servos": [servo.model_dump() for servo in servos],
     }
+
+
+def _nominal_model(plant: PlantSettings) -> dict[str, Any]:
+    """Return what the model-based laws are told of an arm: `ModelSettings`, as a table."""
+    known = {name: True for name in ModelSettings.model_fields if name != "links"}
+    return plant.model_dump(
+        include={**known, "links": {"__all__": set(LinkModel.model_fields)}}
+    )
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 from controller.errors import CommandError
 from controller.faults import FaultCode, Reaction
-from controller.law import PassivityLaw
 from controller.limits import MotionGuard, TorqueLimiter
 from controller.machine import Machine, State, Trigger
 from controller.player import ReferencePlayer, Setpoint
+from controller.registry import make_law
 from controller.velocity import VelocityEstimator, make_estimator
 from drivers.axis import Axis, AxisStatus
 from drivers.errors import BusError
@@ -77,7 +77,7 @@ class Control:
         settings, n = config.controller, config.joints
         self.machine = Machine()
         self.player = ReferencePlayer(n, config.loop.period_s)
-        self.law = PassivityLaw(settings.law, settings.limits.tau_max_Nm)
+        self.law = make_law(settings)
         self.q_rad = [0.0] * n
         self.dq_rad_s = [0.0] * n
         self.tau_cmd_Nm = [0.0] * n

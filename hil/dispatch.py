@@ -4,17 +4,19 @@ Everything that can be refused without asking the loop is refused here: form, jo
 """
 
 import json
+import sys
 import threading
+import traceback
 from dataclasses import dataclass, field
-from itertools import count
 from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.faults import FaultCode
 from controller.machine import State
-from controller.reference import MotionLimits, MotionState
+from controller.reference import MotionLimits, MotionState, Reference
 from hil import messages
 from hil.config import Config
 from hil.errors import HilError
@@ -26,6 +28,7 @@ from hil.messages import (
     GainBoundsRequest,
     Reply,
     Request,
+    RequestError,
     ResetRequest,
     StopRequest,
 )
@@ -33,10 +36,13 @@ from hil.planner import Refusal, plan
 from hil.shared import SLOTS, STATUS_EVERY_S, SharedMemory
 
 OUTCOME_TIMEOUT_S = 1.0
+POLL_EVERY_S = 0.002
+EVENTS_AT_ONCE = 100
 LEAD_S = 0.1
 """A trajectory that continues a running one meets it this far ahead: time to plan it."""
 LEADS_TRIED = (1, 4, 12)
-
+URGENT = frozenset({"estop", "stop", "disable"})
+"""Requests that wait for no other one: they are answered in a thread of their own."""
 
 SETTLED = {
     "enable": {State.READY},
@@ -46,11 +52,13 @@ SETTLED = {
 """States in which a command has taken full effect and is answered."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Present:
-    """The loop's last sample, as far as commands need it; replaced whole by the stream."""
+    """The loop's last sample, as far as commands need it."""
 
     state: State = State.INIT
+    fault: FaultCode = FaultCode.NONE
+    cycle: int = -1
     t_ref_s: float = 0.0
     q_des_rad: list[float] = field(default_factory=list)
 
@@ -67,7 +75,9 @@ def check_gain_bounds(request: GainBoundsRequest, config: Config) -> None:
     """
     law = config.controller.law
     if len(request.Kd_min) != config.joints:
-        raise Refusal(f"bounds for {len(request.Kd_min)} joints, the arm has {config.joints}")
+        given = len(request.Kd_min)
+        reason = f"bounds for {given} joints, the arm has {config.joints}"
+        raise Refusal(reason, "joints", value=given, limit=config.joints)
     for joint, (low, high) in enumerate(zip(request.Kd_min, request.Kd_max, strict=True), start=1):
         if low < law.Kd_floor:
             reason = f"joint {joint}: Kd_min {low:g} is below the floor {law.Kd_floor:g}"
@@ -78,14 +88,9 @@ def check_gain_bounds(request: GainBoundsRequest, config: Config) -> None:
 
 
 class Dispatcher:
-    """Answers one request at a time, in a thread of its own.
-
-    Attributes:
-        present: The loop's last sample; set by the stream.
-    """
+    """Answers requests: one thread for those in `URGENT`, one for all others."""
 
     def __init__(self, shared: SharedMemory) -> None:
-        self.present = Present()
         self._shared = shared
         self._config = shared.config
         self._limits = MotionLimits.of(
@@ -96,21 +101,41 @@ class Dispatcher:
             "disable": shared.config.controller.limits.stop_timeout_s + OUTCOME_TIMEOUT_S,
             "estop": OUTCOME_TIMEOUT_S,
         }
-        self._ids = count(1)
-        self._outcomes: dict[int, dict[str, Any]] = {}
-        self._arrived = threading.Condition()
+        self._lock = threading.Lock()
+        self._events = shared.follower("events")
+        self._awaited: dict[int, dict[str, Any]] = {}
+        self._handed_over: dict[int, tuple[int, int]] = {}
         status = shared.status()  # of a loop that was there before this process
         self._slot: int = status.get("active_slot", -1)
         self._samples: int = status.get("active_samples", 0)
 
-    def take_outcome(self, event: dict[str, Any]) -> None:
-        """Note what the loop says about a command; called by the stream."""
-        with self._arrived:
-            self._outcomes[event["id"]] = event
-            self._arrived.notify_all()
+    @property
+    def present(self) -> Present:
+        """The loop's state as of its last cycle."""
+        record = self._shared.samples.last()
+        if record is None:
+            return Present()
+        row = self._shared.layout.decode([record])[0]
+        return Present(
+            State(int(row["state"])),
+            FaultCode(int(row["fault"])),
+            int(row["cycle"]),
+            float(row["t_ref_s"]),
+            row["q_des_rad"].tolist(),
+        )
+
+    def forestall(self, verb: str, payload: bytes) -> None:
+        """Pass an emergency stop on to the loop at once; its answer may wait for its turn."""
+        if verb != "estop":
+            return
+        try:
+            messages.parse(verb, payload)
+        except RequestError:
+            return  # refused when it is answered
+        self._shared.request_estop()
 
     def answer(self, verb: str, payload: bytes) -> Reply:
-        """Carry out one request. Never raises for anything a client can send."""
+        """Carry out one request. Never raises: its thread has others to answer."""
         request_id = None
         try:
             request = messages.parse(verb, payload)
@@ -120,6 +145,10 @@ class Dispatcher:
             return refusal.reply(request_id)
         except HilError as error:
             return Reply(ok=False, reason=str(error), request_id=request_id)
+        except Exception as error:  # noqa: BLE001 - a mistake of ours may not end the service
+            traceback.print_exc(file=sys.stderr)
+            reason = f"internal error in {verb}: {type(error).__name__}: {error}"
+            return Reply(ok=False, reason=reason, request_id=request_id)
 
     def _carry_out(self, verb: str, request: Request) -> Reply:
         if isinstance(request, GainBoundsRequest):
@@ -142,30 +171,57 @@ class Dispatcher:
 
     def _until(self, verb: str) -> Reply:
         """Send one command and wait until it has taken full effect, or the arm is in fault."""
-        if verb == "estop":
-            self._shared.request_estop()
-        reply = self._order(verb)
+        outcome = self._await_outcome(self._post(verb, {}), OUTCOME_TIMEOUT_S)
+        if not outcome["ok"]:
+            return Reply(ok=False, reason=outcome["reason"])
         deadline_s = monotonic() + self._patience_s[verb]
-        while reply.ok and (state := self.present.state) not in SETTLED[verb]:
-            if state is State.FAULT:
-                fault = self._shared.status().get("fault", "unknown")
-                return Reply(ok=False, reason=f"{verb}: the arm went into FAULT ({fault})")
-            if monotonic() > deadline_s:
-                return Reply(ok=False, reason=f"{verb}: still in state {state.name}")
-            sleep(0.002)
-        return reply
+        while monotonic() < deadline_s:
+            present = self.present
+            if present.cycle >= outcome["cycle"]:  # earlier ones know nothing of it
+                if present.state in SETTLED[verb]:
+                    return Reply(ok=True)
+                if present.state is State.FAULT:
+                    reason = f"{verb}: the arm went into FAULT ({present.fault.name})"
+                    return Reply(ok=False, reason=reason)
+            sleep(POLL_EVERY_S)
+        return Reply(ok=False, reason=f"{verb}: still in state {self.present.state.name}")
 
-    def _post(self, verb: str, arguments: dict[str, Any]) -> int:
-        number = next(self._ids)
-        command = {"id": number, "verb": verb, **arguments}
-        self._shared.commands.append(json.dumps(command).encode())
+    def _post(
+        self, verb: str, arguments: dict[str, Any], slot: tuple[int, int] | None = None
+    ) -> int:
+        with self._lock:
+            number = self._shared.commands.head  # no other command, of no other gateway, has it
+            self._awaited[number] = {}
+            if slot is not None:
+                self._handed_over[number] = slot
+            command = {"id": number, "verb": verb, **arguments}
+            self._shared.commands.append(json.dumps(command).encode())
         return number
 
     def _await_outcome(self, number: int, timeout_s: float) -> dict[str, Any]:
-        with self._arrived:
-            if not self._arrived.wait_for(lambda: number in self._outcomes, timeout_s):
-                raise _OutcomeTimeoutError("the control loop does not answer")
-            return self._outcomes.pop(number)
+        deadline_s = monotonic() + timeout_s
+        while True:
+            with self._lock:
+                self._take_outcomes()
+                if self._awaited[number] or monotonic() > deadline_s:
+                    outcome = self._awaited.pop(number)
+                    break
+            sleep(POLL_EVERY_S)
+        if not outcome:
+            raise _OutcomeTimeoutError("the control loop does not answer")
+        return outcome
+
+    def _take_outcomes(self) -> None:
+        """Note what the loop says about commands, also about those nobody waits for any more."""
+        for event in self._events.read_json(EVENTS_AT_ONCE):
+            if event.get("kind") != "command":
+                continue
+            number = event["id"]
+            if number in self._awaited:
+                self._awaited[number] = event
+            handed_over = self._handed_over.pop(number, None)
+            if handed_over is not None and event["ok"]:
+                self._slot, self._samples = handed_over
 
     def _inject(self, request: FaultRequest) -> Reply:
         if not (request.target == "amplifier" and request.kind == "off"):
@@ -175,7 +231,8 @@ class Dispatcher:
             )
         joints = [request.joint] if request.joint else list(range(1, self._config.joints + 1))
         if max(joints) > self._config.joints:
-            raise Refusal(f"joint {request.joint}: the arm has {self._config.joints} joints")
+            reason = f"joint {max(joints)}: the arm has {self._config.joints} joints"
+            raise Refusal(reason, "joints", value=max(joints), limit=self._config.joints)
         replies = [self._order("fault", joint=joint) for joint in joints]
         return next((reply for reply in replies if not reply.ok), replies[0])
 
@@ -183,28 +240,28 @@ class Dispatcher:
 
     def _start(self, request: messages.TrajectoryRequest) -> Reply:
         """Plan from the reference in force, write a free slot, hand it over."""
-        if self.present.state not in (State.READY, State.ACTIVE, State.HOLD):
-            remedy = "; enable first" if self.present.state is State.IDLE else ""
-            raise Refusal(
-                f"a trajectory is not possible in state {self.present.state.name}{remedy}"
-            )
+        state = self.present.state
+        if state not in (State.READY, State.ACTIVE, State.HOLD):
+            remedy = "; enable first" if state is State.IDLE else ""
+            raise Refusal(f"a trajectory is not possible in state {state.name}{remedy}")
         outcome: dict[str, Any] = {}
         for lead in LEADS_TRIED:
-            at_index, state = self._junction(lead * LEAD_S)
-            reference = plan(request, state, self._limits, self._config.loop.period_s)
-            slot = self._free_slot()
-            rows = reference.rows()
-            self._rows(slot, rows.size)[:] = rows.ravel()
-            number = self._post(
-                "trajectory", {"slot": slot, "samples": reference.samples, "at_index": at_index}
-            )
+            at_index, start = self._junction(lead * LEAD_S)
+            reference = plan(request, start, self._limits, self._config.loop.period_s)
+            number = self._hand_over(reference, at_index)
             outcome = self._await_outcome(number, lead * LEAD_S + OUTCOME_TIMEOUT_S)
             if outcome["ok"]:
-                self._slot, self._samples = slot, reference.samples
                 return Reply(ok=True, duration_s=reference.duration_s)
             if "reference has changed" not in outcome["reason"] and "late" not in outcome["reason"]:
                 break
         return Reply(ok=False, reason=outcome["reason"])
+
+    def _hand_over(self, reference: Reference, at_index: int | None) -> int:
+        slot = self._free_slot()
+        rows = reference.rows()
+        self._rows(slot, rows.size)[:] = rows.ravel()
+        command = {"slot": slot, "samples": reference.samples, "at_index": at_index}
+        return self._post("trajectory", command, (slot, reference.samples))
 
     def _junction(self, lead_s: float) -> tuple[int | None, MotionState]:
         """Return the row of the running motion to continue from, and the motion there."""
@@ -221,8 +278,18 @@ class Dispatcher:
         return index, MotionState(row[:n], row[n : 2 * n], row[2 * n :])
 
     def _free_slot(self) -> int:
-        """Return a slot other than the one that is being played."""
-        return (self._slot + 1) % SLOTS
+        """Return a slot that is neither played nor waiting to be.
+
+        Raises:
+            Refusal: If the loop has not said what became of earlier trajectories.
+        """
+        with self._lock:
+            self._take_outcomes()
+            taken = {self._slot, *(slot for slot, _ in self._handed_over.values())}
+        free = [slot for slot in range(SLOTS) if slot not in taken]
+        if not free:
+            raise Refusal("the control loop has not answered earlier trajectories")
+        return free[0]
 
     def _rows(self, slot: int, doubles: int) -> NDArray[np.float64]:
         return np.frombuffer(self._shared.slot(slot), dtype=np.float64)[:doubles]

@@ -1,16 +1,18 @@
 """One experiment from enabling to rest: its trajectory request, and its run in virtual time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from controller.machine import State
 from controller.reference import MotionLimits, MotionState
 from hil.config import Config
+from hil.fixed_protobuf import Records
 from hil.messages import KellyRequest, TrajectoryRequest
 from hil.planner import plan
 from hil.scenarios import Scenario
-from hil.simulation import Simulation, SimulationError, open_recording
+from hil.simulation import Simulation, SimulationError, Sink, open_recording
+from hil.telemetry import SampleLayout
 
 SETTLE_CYCLES = 100
 """Cycles recorded after the end of the trajectory."""
@@ -40,13 +42,38 @@ def scenario_settings(scenario: Scenario) -> dict[str, Any]:
     }
 
 
+class Memory:
+    """Keeps the samples of a run in memory; frames and events are let go."""
+
+    def __init__(self, joints: int) -> None:
+        self._layout = SampleLayout(joints, with_truth=True)
+        self._payloads: list[bytes] = []
+
+    def add_sample(self, t_ns: int, seq: int, payload: bytes) -> None:
+        """Keep one sample."""
+        del t_ns, seq
+        self._payloads.append(payload)
+
+    def add_bus_log(self, t_ns: int, payload: bytes) -> None:
+        """Let frames go."""
+
+    def add_event(
+        self, t_ns: int, cycle: int, kind: str, detail: Mapping[str, Any] | str = "{}"
+    ) -> None:
+        """Let an event go."""
+
+    def samples(self) -> Records:
+        """Return all samples, one row a cycle."""
+        return self._layout.decode(self._payloads)
+
+
 def run_in_simulation(
     config: Config,
     request: TrajectoryRequest,
     path: Path,
     progress: Callable[[float], object] | None = None,
 ) -> float:
-    """Enable, play one trajectory to its end, disable; record everything.
+    """Enable, play one trajectory to its end, disable; record everything in a file.
 
     Args:
         config: The configuration.
@@ -62,26 +89,35 @@ def run_in_simulation(
         SimulationError: If the arm tripped; the recording shows how.
     """
     with open_recording(config, path) as recording:
-        simulation = Simulation(config, recording)
-        simulation.execute("enable")
-        simulation.run_until(State.READY, 1000)
-        start = MotionState.at_rest(simulation.control.player.setpoint.q_rad)
-        period_s = config.loop.period_s
-        limits = MotionLimits.of(config.controller.limits, config.trajectory.max_duration_s)
-        reference = plan(request, start, limits, period_s)
-        simulation.play(reference)
-        second = round(1.0 / period_s)
-        cycles = reference.samples + SETTLE_CYCLES
-        for done in range(0, cycles, second):
-            simulation.run(min(second, cycles - done))
-            if progress is not None:
-                progress(min(second, cycles - done) * period_s)
-        machine = simulation.control.machine
-        if not machine.state.is_powered:
-            raise SimulationError(
-                f"the arm went into {machine.state.name} ({machine.fault.name}); see {path}"
-            )
-        simulation.execute("disable")
-        simulation.run_until(State.IDLE, STOP_CYCLES)
+        return play_in_simulation(config, request, recording, progress)
+
+
+def play_in_simulation(
+    config: Config,
+    request: TrajectoryRequest,
+    sink: Sink,
+    progress: Callable[[float], object] | None = None,
+) -> float:
+    """As `run_in_simulation`, into any sink."""
+    simulation = Simulation(config, sink)
+    simulation.execute("enable")
+    simulation.run_until(State.READY, 1000)
+    start = MotionState.at_rest(simulation.control.player.setpoint.q_rad)
+    period_s = config.loop.period_s
+    limits = MotionLimits.of(config.controller.limits, config.trajectory.max_duration_s)
+    reference = plan(request, start, limits, period_s)
+    simulation.play(reference)
+    second = round(1.0 / period_s)
+    cycles = reference.samples + SETTLE_CYCLES
+    for done in range(0, cycles, second):
+        simulation.run(min(second, cycles - done))
+        if progress is not None:
+            progress(min(second, cycles - done) * period_s)
+    machine = simulation.control.machine
+    if not machine.state.is_powered:
         simulation.close()
-        return simulation.cycle * period_s
+        raise SimulationError(f"the arm went into {machine.state.name} ({machine.fault.name})")
+    simulation.execute("disable")
+    simulation.run_until(State.IDLE, STOP_CYCLES)
+    simulation.close()
+    return simulation.cycle * period_s

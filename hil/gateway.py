@@ -119,7 +119,7 @@ def main(shared_fd: int, parent_pid: int) -> int:
     try:
         with open_session(shared.config.zenoh) as session:
             Gateway(shared, session).run(parent_pid)
-    except HilError as error:
+    except (HilError, zenoh.ZError) as error:
         print(f"hil: {error}", file=sys.stderr)  # noqa: T201 - the line the user is promised
         return 1
     return 0

@@ -88,6 +88,7 @@ class Loop:
             signal.signal(number, self._end)
         sleeper = Sleeper()
         status_every = round(STATUS_EVERY_S / self._config.loop.period_s)
+        look_after_at = 0
         farewell = FAREWELL_CYCLES
         start_ns = now_ns() + self._period_ns
         while farewell:
@@ -98,7 +99,8 @@ class Loop:
             self._overruns += skipped
             self._cycle += skipped
             self._run_cycle(start_ns, woke_ns, 1 if self._is_lockstep else 1 + skipped)
-            if self._cycle % status_every == 0:
+            if self._cycle >= look_after_at:
+                look_after_at = self._cycle + status_every
                 self._look_after()
             self._cycle += 1
             start_ns += self._period_ns

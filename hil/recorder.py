@@ -1,18 +1,22 @@
-"""The recorder process: writes what the loop left in shared memory to an MCAP file."""
+"""The recorder process: writes what the loop left in shared memory to an MCAP file.
 
-import json
+Its places in the rings move on only when what was read is in the kernel's hands: a recorder that
+is killed leaves a readable file, and its successor's file begins where that one ends, or a little
+before.
+"""
+
 import signal
 import sys
-import threading
 from pathlib import Path
 from time import sleep
 
 from hil.errors import HilError
+from hil.process import outlast_loop
 from hil.realtime import die_with_parent
 from hil.recording import RecordingWriter
 from hil.shared import SharedMemory
 
-DRAIN_EVERY_S = 0.05
+DRAIN_EVERY_S = 0.1
 AT_ONCE = 4000
 
 
@@ -42,23 +46,31 @@ class Recorder:
             log = b"".join(records)
             first = self._shared.frame_layout.decode_log(log[: self._shared.frame_layout.size])[0]
             self._writer.add_bus_log(first.t_ns, log)
-        for record in self._events.read(AT_ONCE):
-            event = json.loads(record)
+        for event in self._events.read_json(AT_ONCE):
             t_ns, cycle, kind = event.pop("t_ns"), event.pop("cycle"), event.pop("kind")
             self._writer.add_event(t_ns, cycle, kind, event)
+        self._writer.flush()
+        for reader in (self._samples, self._frames, self._events):
+            reader.commit()
 
-    def run(self) -> None:
-        """Drain until SIGTERM, and once more then.
+    @property
+    def is_empty(self) -> bool:
+        """Nothing has been recorded."""
+        return self._samples.place == 0
+
+    def run(self, parent_pid: int) -> None:
+        """Drain until SIGTERM; without supervisor, until the loop has ended.
 
         Raises:
             RecordingError: If the file cannot be written.
         """
-        is_ended = threading.Event()
-        signal.signal(signal.SIGTERM, lambda *_: is_ended.set())
+        signals: list[int] = []
+        signal.signal(signal.SIGTERM, lambda number, _: signals.append(number))
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor decides
-        while not is_ended.is_set():
+        while not signals:
             self.drain()
             sleep(DRAIN_EVERY_S)
+        outlast_loop(self._shared, parent_pid, self.drain)
         self.drain()
         lost = {
             "samples": self._samples.lost,
@@ -82,7 +94,10 @@ def main(shared_fd: int, parent_pid: int, path: str) -> int:
         with RecordingWriter(
             Path(path), config.model_dump_json(), config.joints, with_truth=False
         ) as writer:
-            Recorder(shared, writer).run()
+            recorder = Recorder(shared, writer)
+            recorder.run(parent_pid)
+        if recorder.is_empty:  # the loop never came to a cycle: nothing to keep
+            Path(path).unlink(missing_ok=True)
     except HilError as error:
         print(f"hil: {error}", file=sys.stderr)  # noqa: T201 - the line the user is promised
         return 1

@@ -9,6 +9,8 @@ from hil.config import ZenohSettings
 from hil.errors import HilError
 
 CONNECT_TIMEOUT_MS = 3000
+RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
+"""How often a lost connection is tried anew: a restarted gateway is back within a second or two."""
 
 
 class SessionError(HilError):
@@ -28,6 +30,7 @@ def open_session(settings: ZenohSettings) -> zenoh.Session:
         "connect/endpoints": list(settings.connect),
         "connect/timeout_ms": CONNECT_TIMEOUT_MS,
         "connect/exit_on_failure": True,
+        "connect/retry": RETRY,
         "scouting/multicast/enabled": settings.multicast_scouting,
     }
     try:

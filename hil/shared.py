@@ -158,7 +158,7 @@ class RingReader:
         return records
 
     def read_json(self, most: int) -> list[dict[str, Any]]:
-        """Return up to `most` new JSON objects; a record that is none (cut, torn) counts as lost."""
+        """Return up to `most` new JSON objects; a record that is none (cut, torn) is lost."""
         objects = []
         for record in self.read(most):
             try:

@@ -5,7 +5,7 @@ Nothing here asks the real clock, so that the same run gives the same bytes.
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from controller.machine import State, Trigger
 from controller.reference import Reference
@@ -34,6 +34,21 @@ class SimulationError(HilError):
     """A simulated run could not be carried out as asked."""
 
 
+class Sink(Protocol):
+    """Takes what a run produces; `hil.recording.RecordingWriter` is one."""
+
+    def add_sample(self, t_ns: int, seq: int, payload: bytes) -> None:
+        """Take one serialised sample."""
+
+    def add_bus_log(self, t_ns: int, payload: bytes) -> None:
+        """Take some serialised bus frames."""
+
+    def add_event(
+        self, t_ns: int, cycle: int, kind: str, detail: Mapping[str, Any] | str = "{}"
+    ) -> None:
+        """Take an event."""
+
+
 class Simulation:
     """Controller, drivers, frames, emulated amplifiers and arm, advanced cycle by cycle.
 
@@ -44,11 +59,11 @@ class Simulation:
         frames: Bus frames so far, both directions.
     """
 
-    def __init__(self, config: Config, recording: RecordingWriter | None = None) -> None:
+    def __init__(self, config: Config, sink: Sink | None = None) -> None:
         self.config = config
         self.cycle = 0
         self.frames = 0
-        self._recording = recording
+        self._sink = sink
         self._period_ns = round(config.loop.period_s * 1e9)
         self._clock_ns = 0
         self._is_starting = True
@@ -75,7 +90,7 @@ class Simulation:
         loopback.connect(emulator.receive, self._wait)
         axes = make_axes(config.axes, period_s=config.loop.period_s)
         bus = ArmBus(loopback, axes, now_ns=lambda: self._clock_ns)
-        if self._recording is not None:
+        if self._sink is not None:
             bus.log_frames(self._log_frame)
         emulator.power_on()
         heartbeat_s = min(axis.heartbeat_ms for axis in config.axes) * 1e-3
@@ -91,9 +106,9 @@ class Simulation:
         self._executor.begin_cycle(1)
         self.control.step(self._clock_ns, 1)
         stamp = (self.cycle, self._clock_ns, 0)
-        if self._recording is not None:
+        if self._sink is not None:
             self._sampler.write(self._sample, 0, stamp, NO_STAMPS)
-            self._recording.add_sample(self._clock_ns, self._sampler.seq - 1, bytes(self._sample))
+            self._sink.add_sample(self._clock_ns, self._sampler.seq - 1, bytes(self._sample))
             if self.cycle % FRAMES_EVERY == 0:
                 self._flush_frames()
         self.cycle += 1
@@ -154,8 +169,8 @@ class Simulation:
         return plant.q_true_rad, plant.dq_true_rad_s, plant.tau_applied_Nm
 
     def _emit(self, kind: str, detail: Mapping[str, Any]) -> None:
-        if self._recording is not None:
-            self._recording.add_event(self._clock_ns, self.cycle, kind, detail)
+        if self._sink is not None:
+            self._sink.add_event(self._clock_ns, self.cycle, kind, detail)
 
     def _report_outcome(self, command: Mapping[str, Any], reason: str) -> None:
         self._emit("command", {"verb": command["verb"], "ok": not reason, "reason": reason})
@@ -169,8 +184,8 @@ class Simulation:
         self._log.append(self._entry(self._clock_ns, direction, frame))
 
     def _flush_frames(self) -> None:
-        if self._log and self._recording is not None:
-            self._recording.add_bus_log(self._log_ns, b"".join(self._log))
+        if self._log and self._sink is not None:
+            self._sink.add_bus_log(self._log_ns, b"".join(self._log))
         self._log = []
 
     def close(self) -> None:

@@ -73,7 +73,7 @@ class Streams:
         for record in self._events.read(EVENTS_AT_ONCE):
             self._event.put(record)
 
-    def run(self, is_ended: "list[int]") -> None:
+    def run(self, is_ended: list[int]) -> None:
         """Take a turn every 10 ms until `is_ended` is not empty, and one more then."""
         every = round(STATUS_EVERY_S / STREAM_EVERY_S)
         turns = 0

@@ -6,19 +6,29 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
+from typing import Any
 
 from hil.config import Config
 from hil.errors import HilError
 from hil.shared import SharedMemory
 
 WATCH_EVERY_S = 0.02
-START_TIMEOUT_S = 15.0
+START_TIMEOUT_S = 30.0
+START_SAMPLES = 20
+"""Cycles after which the amplifiers' state is known."""
 STOP_MARGIN_S = 3.0
 RESTART_PAUSE_S = 0.2
+RESTART_PAUSE_MAX_S = 10.0
+STEADY_S = 10.0
+"""A child that lasted this long is restarted as promptly as the first time."""
+
+OnReady = Callable[[Mapping[str, Any]], None]
+"""Called once with the loop's status."""
 
 
 class RunError(HilError):
@@ -33,11 +43,14 @@ def sole_daemon(arm: str) -> Iterator[None]:
         RunError: If another daemon holds it.
     """
     path = Path(tempfile.gettempdir()) / f"hil-{arm}.lock"
-    with path.open("a+") as file:
+    try:
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        raise RunError(f"cannot lock arm {arm!r}: {path}: {error.strerror}") from error
+    with open(fd, "r+") as file:  # noqa: PTH123 - a descriptor
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            file.seek(0)
             pid = file.read().strip() or "unknown"
             raise RunError(
                 f"arm {arm!r} already has a daemon on this host (pid {pid}); stop it, or give this "
@@ -47,6 +60,19 @@ def sole_daemon(arm: str) -> Iterator[None]:
         file.write(f"{os.getpid()}\n")
         file.flush()
         yield
+
+
+@dataclass(slots=True)
+class _Child:
+    process: "subprocess.Popen[bytes]"
+    started_s: float
+    failures: int = 0
+    restart_s: float | None = None
+
+    @property
+    def status(self) -> int | None:
+        """Exit status, negative for a signal; None while it runs."""
+        return self.process.poll()
 
 
 class Supervisor:
@@ -60,18 +86,22 @@ class Supervisor:
         self._shared = SharedMemory.create(config)
         self._config = config
         self._recording = recording
-        self._restarts = 0
-        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._recordings = 0
+        self._children: dict[str, _Child] = {}
         self._is_ended = False
 
-    def run(self, on_ready: Callable[[], None] | None = None) -> int:
+    def run(self, on_ready: OnReady) -> int:
         """Run until SIGINT or SIGTERM, or until the loop ends by itself.
 
         Args:
-            on_ready: Called once when the loop is cycling and the gateway can be reached.
+            on_ready: Called when the loop is cycling and the gateway can be reached.
 
         Returns:
-            0 after an orderly stop, 1 if the loop failed.
+            0 after an orderly stop, 1 if the daemon could not start or the loop failed; one line
+            on stderr has said why.
+
+        Raises:
+            RunError: If the children do not come up in time. They have been ended.
         """
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._end)
@@ -79,96 +109,137 @@ class Supervisor:
             self._spawn("loop")
             self._spawn("gateway")
             if self._recording is not None:
-                self._spawn("recorder", str(self._recording))
-            if self._await_start() and on_ready is not None:
-                on_ready()
+                self._spawn("recorder")
+            status = self._await_start()
+            if status is not None:
+                return status
+            on_ready(self._shared.status())
             return self._watch()
         finally:
             self._stop_all()
 
-    def _spawn(self, name: str, *arguments: str) -> None:
+    # --- children ----------------------------------------------------------------------------
+
+    def _spawn(self, name: str, failures: int = 0) -> None:
         command = [sys.executable, "-m", "hil.process", name]
-        command += [str(self._shared.fd), str(os.getpid()), *arguments]
-        self._children[name] = subprocess.Popen(  # noqa: S603 - our own module and arguments
+        command += [str(self._shared.fd), str(os.getpid())]
+        if name == "recorder":
+            command.append(str(self._next_recording()))
+        process = subprocess.Popen(  # noqa: S603 - our own module and arguments
             command, pass_fds=[self._shared.fd], start_new_session=True
         )
+        self._children[name] = _Child(process, monotonic(), failures)
 
-    def _await_start(self) -> bool:
+    def _next_recording(self) -> Path:
+        """A restarted recorder goes on in a file of its own: the first stays as it is."""
+        assert self._recording is not None  # noqa: S101 - there is a recorder
+        self._recordings += 1
+        if self._recordings == 1:
+            return self._recording
+        return self._recording.with_stem(f"{self._recording.stem}-{self._recordings}")
+
+    def _await_start(self) -> int | None:
+        """Wait until loop and gateway show themselves.
+
+        Returns:
+            The daemon's exit status if it is over before it has begun, else None.
+
+        Raises:
+            RunError: If they do not in time.
+        """
         deadline_s = monotonic() + START_TIMEOUT_S
-        while monotonic() < deadline_s and not self._is_ended:
-            if self._shared.last_beat("loop") and self._shared.last_beat("gateway"):
-                return True
-            if any(child.poll() is not None for child in self._children.values()):
-                return False
+        while not self._is_ended:
+            is_cycling = self._shared.status().get("samples", 0) >= START_SAMPLES
+            if is_cycling and self._shared.last_beat("gateway"):
+                return None
+            for name, child in self._children.items():
+                if child.status is not None:
+                    self._explain(name, child.status)
+                    return 1
+            if monotonic() > deadline_s:
+                silent = "gateway" if is_cycling else "control loop"
+                raise RunError(f"the {silent} does not come up within {START_TIMEOUT_S:g} s")
             sleep(WATCH_EVERY_S)
-        return False
+        return self._stop_loop()
 
     def _watch(self) -> int:
         """Return the daemon's exit status when it is over."""
-        has_started = bool(self._shared.last_beat("gateway"))
+        loop = self._children["loop"]
         while not self._is_ended:
-            if self._children["loop"].poll() is not None:
-                return self._report_loop()
-            if not has_started and self._children["gateway"].poll() is not None:
-                return 1  # it has said why: endpoint in use, for example
-            has_started = has_started or bool(self._shared.last_beat("gateway"))
+            if loop.status is not None:
+                self._explain("loop", loop.status)
+                return 1
             self._restart_dead()
             sleep(WATCH_EVERY_S)
         return self._stop_loop()
 
-    def _report_loop(self) -> int:
-        status = self._children["loop"].returncode
-        if status < 0:
-            name = signal.Signals(-status).name
-            print(  # noqa: T201 - the line the user is promised
-                f"hil: the control loop was killed ({name}); the amplifiers' watchdogs remove "
-                "torque; nothing is enabled again by itself",
-                file=sys.stderr,
+    def _explain(self, name: str, status: int) -> None:
+        """Say why a child ended, unless it has said so itself."""
+        if status > 0:
+            return
+        how = f"was killed ({_signal_name(status)})" if status else "ended without being asked to"
+        if name == "loop":
+            _tell(
+                f"the control loop {how}; the amplifiers' watchdogs remove torque; nothing is "
+                "enabled again by itself"
             )
-        return 1
+        else:
+            _tell(f"the {name} {how}")
 
     def _restart_dead(self) -> None:
-        for name in ("gateway", "recorder"):
-            child = self._children.get(name)
-            if child is None or child.poll() is None:
+        for name, child in list(self._children.items()):
+            if name == "loop" or child.status is None:
                 continue
-            print(  # noqa: T201 - told to the user
-                f"hil: the {name} ended (status {child.returncode}); restarting it", file=sys.stderr
-            )
-            sleep(RESTART_PAUSE_S)
-            self._spawn(name, *self._next_recording() if name == "recorder" else ())
+            now_s = monotonic()
+            if child.restart_s is None:
+                if now_s - child.started_s > STEADY_S:
+                    child.failures = 0
+                pause_s = min(RESTART_PAUSE_S * 2**child.failures, RESTART_PAUSE_MAX_S)
+                child.restart_s = now_s + pause_s
+                status = child.status
+                cause = _signal_name(status) if status < 0 else f"status {status}"
+                _tell(f"the {name} ended ({cause}); restarting it in {pause_s:g} s")
+            elif now_s >= child.restart_s:
+                self._spawn(name, child.failures + 1)
 
-    def _next_recording(self) -> tuple[str]:
-        """A restarted recorder goes on in a file of its own: the first stays as it is."""
-        assert self._recording is not None  # noqa: S101 - there is a recorder
-        self._restarts += 1
-        path = self._recording
-        return (str(path.with_stem(f"{path.stem}-{self._restarts + 1}")),)
+    # --- the end -----------------------------------------------------------------------------
 
     def _stop_loop(self) -> int:
         """Ask the loop for an orderly end and wait for it."""
-        loop = self._children["loop"]
+        loop = self._children["loop"].process
         loop.terminate()
         allowed_s = self._config.controller.limits.stop_timeout_s + STOP_MARGIN_S
         try:
-            return 0 if loop.wait(allowed_s) == 0 else 1
+            status = loop.wait(allowed_s)
         except subprocess.TimeoutExpired:
-            print("hil: the control loop does not end; killing it", file=sys.stderr)  # noqa: T201
+            _tell("the control loop does not end; killing it")
             return 1
+        return 0 if status in (0, -signal.SIGTERM) else 1  # by SIGTERM: before its first cycle
 
     def _stop_all(self) -> None:
         """End the loop first, so that gateway and recorder see its last samples."""
         for name in ("loop", "gateway", "recorder"):
-            child = self._children.get(name)
-            if child is None:
+            if name not in self._children:
                 continue
-            if child.poll() is None:
-                child.terminate()
+            process = self._children[name].process
+            if process.poll() is None:
+                process.terminate()
             try:
-                child.wait(STOP_MARGIN_S)
+                process.wait(STOP_MARGIN_S)
             except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()
+                process.kill()
+                process.wait()
 
     def _end(self, *_: object) -> None:
         self._is_ended = True
+
+
+def _signal_name(status: int) -> str:
+    try:
+        return signal.Signals(-status).name
+    except ValueError:  # a real-time signal has no name
+        return f"signal {-status}"
+
+
+def _tell(line: str) -> None:
+    print(f"hil: {line}", file=sys.stderr)  # noqa: T201 - the line the user is promised

@@ -8,7 +8,8 @@ advances everything by one period; otherwise the caller passes the wall's time o
 from collections.abc import Sequence
 
 from drivers.frame import ERR_FLAG, FRAME_SIZE, RTR_FLAG, unpack_frame
-from sim_backend.arm import CURRENT_LOOP_PERIOD_NS, Arm
+from sim_backend.arm import Arm
+from sim_backend.chain import CURRENT_LOOP_PERIOD_NS
 from sim_backend.errors import SimError
 from sim_backend.node import AmplifierNode
 from sim_backend.servo import CURRENT_LOOP_PERIOD_S, Servo
@@ -32,7 +33,8 @@ class Emulator:
 
     Attributes:
         is_lockstep: See above.
-        q_true_rad: The plant's joint angles at the last SYNC, when the encoders were latched.
+        q_true_rad: The plant's joint angles, of the links, at the last SYNC, when the encoders
+            were latched.
         dq_true_rad_s: The plant's joint rates at the last SYNC.
         tau_applied_Nm: Mean motor torque per joint over the last whole period of 1 ms.
 
@@ -46,6 +48,7 @@ class Emulator:
         "_is_waiting",
         "_nodes",
         "_remainder_ns",
+        "_sense",
         "_servos",
         "dq_true_rad_s",
         "is_lockstep",
@@ -75,8 +78,14 @@ class Emulator:
         self._remainder_ns = 0
         self._first_half_Nm: list[float] | None = None
         self.tau_applied_Nm = [0.0] * count
+        self._sense = self._sense_drivetrains if arm.has_drivetrain else self._sense_joints
         self._sense()
         self._latch_truth()
+
+    @property
+    def arm(self) -> Arm:
+        """The plant, to hand it payloads and disturbances by call."""
+        return self._arm
 
     @property
     def time_ns(self) -> int:
@@ -160,10 +169,18 @@ class Emulator:
         for node in self._nodes:
             node.tick(TICK_S)
 
-    def _sense(self) -> None:
+    def _sense_joints(self) -> None:
         arm = self._arm
         for servo, q_rad, dq_rad_s in zip(self._servos, arm.q_rad, arm.dq_rad_s, strict=True):
             servo.sense(q_rad, dq_rad_s)
+
+    def _sense_drivetrains(self) -> None:
+        """Each encoder reads its side; the winding always feels the rotor."""
+        arm = self._arm
+        rates = arm.dq_motor_rad_s
+        encoders = zip(self._servos, *arm.encoder_motion(), rates, strict=True)
+        for servo, q_rad, dq_rad_s, motor_rad_s in encoders:
+            servo.sense(q_rad, dq_rad_s, motor_rad_s)
 
     def _latch_truth(self) -> None:
         # The arm makes new lists at every step, so these stay what they are.

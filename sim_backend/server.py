@@ -60,7 +60,7 @@ class EmulatorServer:
             if unpack_header(frame) == (SYNC_ID, 0):
                 self._take_sync()
             self._emulator.receive(frame)
-        if self._emulator.is_lockstep and not frames:
+        if self._emulator.is_lockstep:  # also if others than the master talk on
             self._leave_stalled_lockstep()
 
     def _take_sync(self) -> None:

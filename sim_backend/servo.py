@@ -9,7 +9,7 @@ TAU = 2.0 * math.pi
 
 
 class Servo:
-    """Motor, current loop and encoder of one direct-drive axis.
+    """Motor, current loop and encoder of one axis.
 
     The amplifier's node sets `torque_target_Nm` and `is_energised`; the emulator calls `sense`
     with the plant's motion and `drive` once per current-loop period.
@@ -19,8 +19,10 @@ class Servo:
             protocols can carry, demands none.
         is_energised: Power stage on. When off the winding is open: no current, no torque.
         current_A: Winding current at the end of the last current-loop period.
-        q_rad: Joint angle as last sensed (the plant's truth; nodes read `counts`).
-        dq_rad_s: Joint rate as last sensed.
+        q_rad: Angle at the encoder as last sensed (the plant's truth; nodes read `counts`): of the
+            joint, or of the rotor where the encoder is on the motor's side of a drivetrain.
+        dq_rad_s: Rate at the encoder as last sensed.
+        motor_rad_s: Rate of the rotor as last sensed, which makes the back-EMF.
         is_saturated: The current demand was limited, or the voltage was, in the last period.
     """
 
@@ -40,6 +42,7 @@ class Servo:
         "dq_rad_s",
         "is_energised",
         "is_saturated",
+        "motor_rad_s",
         "q_rad",
         "settings",
         "torque_target_Nm",
@@ -52,6 +55,7 @@ class Servo:
         self.current_A = 0.0
         self.q_rad = 0.0
         self.dq_rad_s = 0.0
+        self.motor_rad_s = 0.0
         self.is_saturated = False
         self._integral_V = 0.0
         ratio = CURRENT_LOOP_PERIOD_S * settings.resistance_ohm / settings.inductance_H
@@ -89,10 +93,17 @@ class Servo:
         """Torque at the peak current."""
         return self.settings.current_max_A * self.settings.torque_constant_Nm_A
 
-    def sense(self, q_rad: float, dq_rad_s: float) -> None:
-        """Take over the plant's joint angle and rate."""
+    def sense(self, q_rad: float, dq_rad_s: float, motor_rad_s: float | None = None) -> None:
+        """Take over the plant's motion.
+
+        Args:
+            q_rad: Angle at the encoder.
+            dq_rad_s: Rate at the encoder.
+            motor_rad_s: Rate of the rotor; None if it is that at the encoder.
+        """
         self.q_rad = q_rad
         self.dq_rad_s = dq_rad_s
+        self.motor_rad_s = dq_rad_s if motor_rad_s is None else motor_rad_s
 
     def drive(self) -> float:
         """Run one period of the current loop and return the mean motor torque over it, in Nm."""
@@ -110,7 +121,9 @@ class Servo:
         if voltage_V == wanted_V:  # the integral waits while the supply limits
             self._integral_V += self._integral_gain * error_A
         self.is_saturated = voltage_V != wanted_V or limited_A != demand_A
-        settled_A = (voltage_V - self._torque_constant_Nm_A * self.dq_rad_s) / self._resistance_ohm
+        settled_A = (
+            voltage_V - self._torque_constant_Nm_A * self.motor_rad_s
+        ) / self._resistance_ohm
         self.current_A = settled_A + (before_A - settled_A) * self._decay
         mean_A = settled_A + (before_A - settled_A) * self._mean_weight
         return mean_A * self._torque_constant_Nm_A

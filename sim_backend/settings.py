@@ -54,11 +54,9 @@ class LinkSettings(_Settings):
                 f"static_Nm = {self.static_Nm:g} is below coulomb_Nm = {self.coulomb_Nm:g}:"
                 " static friction is at least Coulomb friction"
             )
-        if self.q_min_rad is not None and self.q_max_rad is not None:
-            if self.q_min_rad >= self.q_max_rad:
-                raise ValueError(
-                    f"q_min_rad = {self.q_min_rad:g} must be below q_max_rad = {self.q_max_rad:g}"
-                )
+        low, high = self.q_min_rad, self.q_max_rad
+        if low is not None and high is not None and low >= high:
+            raise ValueError(f"q_min_rad = {low:g} must be below q_max_rad = {high:g}")
         return self
 
 

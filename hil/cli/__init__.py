@@ -17,6 +17,7 @@ VERBS: Final = {
     "run": "the daemon: control loop, Zenoh gateway, recorder",
     "emulate": "the emulated arm and amplifiers on a bus",
     "sim": "everything in one process, in virtual time",
+    "compare": "laws side by side, in virtual time",
     "send": "command a running daemon",
     "watch": "follow a running daemon",
     "report": "plots and figures from a recording",
@@ -56,5 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except BrokenPipeError:  # the reader of our output has gone, as with `| head`
         sys.stderr.close()
+        return 1
+    except OSError as error:
+        print(f"hil: {error.filename or 'system'}: {error.strerror or error}", file=sys.stderr)
         return 1
     return status

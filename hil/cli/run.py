@@ -2,8 +2,11 @@
 
 import argparse
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from controller.faults import FaultCode
 from hil.budget import require_fit
 from hil.cli.options import add_configuration, configuration
 from hil.config import Config
@@ -27,7 +30,7 @@ def run(options: argparse.Namespace) -> int:
     recording = recording_path(config, options)
     with sole_daemon(config.arm.name):
         supervisor = Supervisor(config, recording)
-        return supervisor.run(lambda: _announce(config, recording))
+        return supervisor.run(lambda status: _announce(config, recording, status))
 
 
 def recording_path(config: Config, options: argparse.Namespace) -> Path | None:
@@ -44,10 +47,13 @@ def recording_path(config: Config, options: argparse.Namespace) -> Path | None:
     return path
 
 
-def _announce(config: Config, recording: Path | None) -> None:
+def _announce(config: Config, recording: Path | None, status: Mapping[str, Any]) -> None:
     listen = ", ".join(config.zenoh.listen) or "nowhere"
+    remedy = "torque is off until it is enabled"
+    if status["fault"] != FaultCode.NONE.name:
+        remedy = f"in state {status['state']} ({status['fault']}): it needs a reset first"
     print(
         f"arm {config.arm.name} is ready on {config.bus.address}, Zenoh on {listen}, "
-        f"recording to {recording or 'nothing'}; torque is off until it is enabled",
+        f"recording to {recording or 'nothing'}; {remedy}",
         flush=True,
     )

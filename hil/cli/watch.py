@@ -3,7 +3,8 @@
 import argparse
 import json
 import signal
-import threading
+from math import inf
+from time import monotonic, sleep
 from typing import Any
 
 from hil.cli.options import add_connection, endpoints
@@ -25,9 +26,9 @@ class Counter:
         for seq in rows["seq"].tolist():
             if self.last < 0:
                 self.first = seq
-            else:
+            elif seq > self.last:
                 self.lost += seq - self.last - 1
-            self.last = seq
+            self.last = seq  # a lower one is the first we get of a new daemon
         self.received += len(rows)
 
 
@@ -42,9 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Follow until SIGINT, SIGTERM or the given time."""
-    ended = threading.Event()
+    signals: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: ended.set())
+        signal.signal(number, lambda signum, _: signals.append(signum))
     counter = Counter()
     with Client(options.arm, endpoints(options)) as client:
         client.on_telemetry(counter.take)
@@ -53,7 +54,9 @@ def run(options: argparse.Namespace) -> int:
         else:
             client.on_status(_print_status)
             client.on_event(_print_event)
-        ended.wait(options.duration_s)
+        deadline_s = monotonic() + (inf if options.duration_s is None else options.duration_s)
+        while not signals and monotonic() < deadline_s:
+            sleep(0.02)
     if options.count:
         print(json.dumps(vars(counter)))
     else:

@@ -10,19 +10,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from math import cos, sin, tanh
+from math import cos, exp, sin, tanh
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from sim_backend.settings import PlantSettings
+from sim_backend.settings import LinkSettings, PlantSettings
 
 Motion = Sequence[float]
 Torque = Callable[[float, Motion], Sequence[float]]
 
 
 class TwoLink:
-    """Two links, H ddq + C dq + g + B dq + Fc tanh(D dq) = tau, written out."""
+    """Two links, H ddq + C dq + g + tau_f = tau, written out, with tau_f the Stribeck curve."""
 
     def __init__(self, settings: PlantSettings) -> None:
         a, b = settings.links
@@ -39,6 +39,8 @@ class TwoLink:
         self.g2 = g * b.mass_kg * b.com_m
         self.b1, self.b2 = a.viscous_Nms_rad, b.viscous_Nms_rad
         self.c1, self.c2 = a.coulomb_Nm, b.coulomb_Nm
+        self.s1, self.s2 = static_excess(a), static_excess(b)
+        self.vs1, self.vs2 = a.stribeck_rad_s, b.stribeck_rad_s
         self.d = settings.tanh_slope_s_rad
 
     def acceleration(self, y: Motion, tau: Sequence[float]) -> tuple[float, float]:
@@ -49,8 +51,10 @@ class TwoLink:
         gravity_2 = self.g2 * sin(q1 + q2)
         e1 = tau[0] + k * (2.0 * v1 + v2) * v2 - self.g1 * sin(q1) - gravity_2
         e2 = tau[1] - k * v1 * v1 - gravity_2
-        e1 -= self.b1 * v1 + self.c1 * tanh(self.d * v1)
-        e2 -= self.b2 * v2 + self.c2 * tanh(self.d * v2)
+        dry1 = self.c1 + self.s1 * exp(-((v1 / self.vs1) ** 2))
+        dry2 = self.c2 + self.s2 * exp(-((v2 / self.vs2) ** 2))
+        e1 -= self.b1 * v1 + dry1 * tanh(self.d * v1)
+        e2 -= self.b2 * v2 + dry2 * tanh(self.d * v2)
         det = h11 * self.h22 - h12 * h12
         return (self.h22 * e1 - h12 * e2) / det, (h11 * e2 - h12 * e1) / det
 
@@ -104,13 +108,16 @@ class Chain:
         self.g = settings.gravity_m_s2 * (mass @ arm)
         self.viscous = np.array([link.viscous_Nms_rad for link in links])
         self.coulomb = np.array([link.coulomb_Nm for link in links])
+        self.excess = np.array([static_excess(link) for link in links])
+        self.vs = np.array([link.stribeck_rad_s for link in links])
         self.d = settings.tanh_slope_s_rad
 
     def acceleration(self, y: Motion, tau: Sequence[float]) -> np.ndarray:
         q, v = np.asarray(y[: self.n]), np.asarray(y[self.n :])
         angle, rate = np.cumsum(q), np.cumsum(v)
         between = angle[:, None] - angle[None, :]
-        joint = np.asarray(tau) - self.viscous * v - self.coulomb * np.tanh(self.d * v)
+        dry = self.coulomb + self.excess * np.exp(-((v / self.vs) ** 2))
+        joint = np.asarray(tau) - self.viscous * v - dry * np.tanh(self.d * v)
         load = joint - np.append(joint[1:], 0.0)  # on the link, less the reaction of the next
         load -= (self.a * np.sin(between)) @ rate**2 + self.g * np.sin(angle)
         absolute = np.linalg.solve(self.a * np.cos(between) + self.inertia, load)
@@ -120,6 +127,17 @@ class Chain:
         angle, rate = np.cumsum(y[: self.n]), np.cumsum(y[self.n :])
         inertia = self.a * np.cos(angle[:, None] - angle[None, :]) + self.inertia
         return float(0.5 * rate @ inertia @ rate - self.g @ np.cos(angle))
+
+    def momentum_Nms(self, y: Motion) -> float:
+        """Angular momentum about the shoulder: all absolute angles turn alike."""
+        angle, rate = np.cumsum(y[: self.n]), np.cumsum(y[self.n :])
+        inertia = self.a * np.cos(angle[:, None] - angle[None, :]) + self.inertia
+        return float(np.ones(self.n) @ inertia @ rate)
+
+
+def static_excess(link: LinkSettings) -> float:
+    """By how much static friction exceeds Coulomb friction."""
+    return 0.0 if link.static_Nm is None else link.static_Nm - link.coulomb_Nm
 
 
 def solve(
