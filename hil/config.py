@@ -205,10 +205,8 @@ def preset_defaults(name: str) -> dict[str, Any]:
 
 def _nominal_model(plant: PlantSettings) -> dict[str, Any]:
     """Return what the model-based laws are told of an arm: `ModelSettings`, as a table."""
-    known = {name: True for name in ModelSettings.model_fields if name != "links"}
-    return plant.model_dump(
-        include={**known, "links": {"__all__": set(LinkModel.model_fields)}}
-    )
+    known: dict[str, Any] = dict.fromkeys(ModelSettings.model_fields, True)
+    return plant.model_dump(include=known | {"links": {"__all__": set(LinkModel.model_fields)}})
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

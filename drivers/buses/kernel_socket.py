@@ -43,13 +43,11 @@ class SocketBus(Bus):
         Of the ways to find out that nothing has come yet, poll() is the cheapest, but its
         time-out has milliseconds; a read that fails costs three times as much.
         """
-        if timeout_s <= 0.0:
-            return self._take()
         if self._poll(0):
             frame = self._take()
             if frame is not None:
                 return frame
-        return self._await(timeout_s)
+        return self._await(timeout_s) if timeout_s > 0.0 else None
 
     def _await(self, timeout_s: float) -> bytes | None:
         deadline_s = monotonic() + timeout_s

@@ -449,7 +449,9 @@ def test_motion_limits__from_settings__takes_every_field():
     fields = ("q_min_rad", "q_max_rad", "dq_max_rad_s", "ddq_max_rad_s2", "dddq_max_rad_s3")
     fields += ("following_error_rad",)
     given_values = {name: (float(i), i + 0.5) for i, name in enumerate(fields)}
-    rest = dict.fromkeys(("tau_max_Nm", "tau_slew_Nm_s", "damping_Nms_rad"), (1.0, 1.0))
+    rest = dict.fromkeys(
+        ("dq_trip_rad_s", "tau_max_Nm", "tau_slew_Nm_s", "damping_Nms_rad"), (1.0, 1.0)
+    )
     limits = MotionLimits.of(LimitSettings(**given_values, **rest), 7.0)
     assert {name: getattr(limits, name) for name in fields} == given_values
     assert limits.max_duration_s == 7.0

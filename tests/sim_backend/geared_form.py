@@ -14,7 +14,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from sim_backend.settings import PlantSettings
-from tests.sim_backend.closed_form import Chain, Motion, Torque
+from tests.sim_backend.closed_form import Chain, Motion
 
 FREE, UPPER, LOWER = 0, 1, -1
 
@@ -62,11 +62,27 @@ class GearedChain:
 
 
 def solve_geared(
-    plant: GearedChain, y0: Motion, times_s: Sequence[float], torque: Torque
+    plant: GearedChain, y0: Motion, legs: Sequence[Sequence[float]], leg_s: float, every_s: float
 ) -> tuple[np.ndarray, int]:
-    """Return the motion at each of `times_s`, shape (time, 4n), and how often flanks touched."""
-    y, t, rows, touches = np.array(y0, float), 0.0, [], 0
-    pending = np.asarray(times_s)
+    """Solve under motor torques that stay for `leg_s` each.
+
+    Returns:
+        The motion at every multiple of `every_s`, shape (time, 4n), and how often flanks touched.
+    """
+    y, rows, touches = np.array(y0, float), [], 0
+    times = every_s * np.arange(1, round(leg_s / every_s) + 1)
+    for tau in legs:
+        leg, count = _solve_leg(plant, y, tau, times)
+        y = leg[-1]
+        rows.append(leg)
+        touches += count
+    return np.concatenate(rows), touches
+
+
+def _solve_leg(
+    plant: GearedChain, y: np.ndarray, tau: Sequence[float], times_s: np.ndarray
+) -> tuple[np.ndarray, int]:
+    t, rows, touches, pending = 0.0, [], 0, times_s
     sides = [
         next((s for s in (UPPER, LOWER) if plant.touch(j, y, s) > 0.0), FREE)
         for j in range(plant.n)
@@ -74,7 +90,7 @@ def solve_geared(
     while len(pending):
         changes = _changes(plant, sides)
         answer = solve_ivp(
-            lambda t, y, sides=tuple(sides): plant.slope(y.tolist(), torque(t, y), sides),
+            lambda _t, y, sides=tuple(sides): plant.slope(y.tolist(), tau, sides),
             (t, pending[-1]),
             y,
             "DOP853",
