@@ -24,6 +24,9 @@ class Gain(ABC):
         """Let the bounds move to new values at the configured rate, from the next step on."""
         self._goal = (Kd_min, Kd_max)
 
+    def reset(self) -> None:  # noqa: B027 - most gains hold nothing that a run leaves behind
+        """Forget the motion of an earlier run; what was learnt stays."""
+
     @abstractmethod
     def step(self, S: float, dt_s: float) -> float:
         """Return the gain for this cycle, in Nm s/rad, and adapt.

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from controller.gain import ConstantGain, Gain, SelfTuningGain
 from controller.player import Setpoint
 from controller.settings import LawSettings
+from controller.tuner import LoadMemoryGain
 
 HALF_PI = math.pi / 2.0
 
@@ -111,8 +112,10 @@ class PassivityLaw(Law):
         self.Kd = [gain.Kd_max for gain in self.gains]
 
     def reset(self) -> None:
-        """Set the integral term to zero."""
+        """Set the integral term to zero and let the gains forget the motion."""
         self._next_sigma = [0.0] * len(self._next_sigma)
+        for gain in self.gains:
+            gain.reset()
 
     def step(
         self,
@@ -146,6 +149,8 @@ class PassivityLaw(Law):
 
 def _make_gain(settings: LawSettings, joint: int) -> Gain:
     if settings.name.startswith("self_tuning"):
+        if settings.tuner == "load_memory":
+            return LoadMemoryGain(settings, joint)
         return SelfTuningGain(settings, joint)
     bounds = (settings.Kd_min[joint], settings.Kd_max[joint])
     return ConstantGain(settings.Kd[joint], bounds, settings.Kd_ramp_per_s)

@@ -30,10 +30,7 @@ from operator import mul
 from controller.gain import ConstantGain
 from controller.law import Law, saturation_limits
 from controller.player import Setpoint
-from controller.settings import ControllerSettings, ModelSettings
-
-PER_JOINT = 5
-"""Parameters per joint: J, b, B, C, tau_d."""
+from controller.settings import PER_JOINT, ControllerSettings, ModelSettings
 
 
 class PlanarChain:
@@ -197,7 +194,7 @@ class SlotineLiLaw(ModelBasedLaw):
         if adaptation.start == "zero":
             self.Theta = [0.0] * len(self.Theta)
         self._Theta_0 = list(self.Theta)
-        self._Gamma = list(adaptation.Gamma) * joints
+        self._Gamma = list(adaptation.Gamma) * (len(self.Theta) // len(adaptation.Gamma))
         self._box = None
         if adaptation.Theta_max is not None:
             *positive, disturbance = adaptation.Theta_max

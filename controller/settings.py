@@ -9,6 +9,8 @@ Joints = tuple[float, ...]
 LawName = Literal[
     "self_tuning_pid", "self_tuning_pd", "pid", "pd", "computed_torque", "slotine_li"
 ]
+PER_JOINT = 5
+"""Parameters per joint of the model-based laws: J, b, B, C, tau_d (`controller.model_based`)."""
 MODEL_BASED = ("computed_torque", "slotine_li")
 """Laws that need `ControllerSettings.model`."""
 MembershipName = Literal["sigmoid", "gaussian_normalised", "gaussian_clipped", "triangular"]
@@ -70,6 +72,18 @@ class LawSettings(_Settings):
     learning_rate: float = Field(
         1e-6, ge=0, description="eta * Upsilon of (28) per 1 ms; scaled with the period"
     )
+    tuner: Literal["paper", "load_memory"] = Field(
+        "paper",
+        description="of the self-tuning laws; load_memory: ours, docs/tuner.md, in which "
+        "membership, beta and adaptation have no part",
+    )
+    load_memory_s: float = Field(0.02, gt=0, description="load_memory: how far back it remembers")
+    load_neutral: float = Field(
+        0.4, ge=0, le=1, description="load_memory: place of the gain without load in its bounds"
+    )
+    load_knee_rad_s: float = Field(
+        0.5, gt=0, description="load_memory: |S| beyond which Kd falls so that torque stays level"
+    )
     tau_clip_Nm: Joints | None = Field(
         None,
         description="the law's own torque limit per joint, for comparisons at equal peak torque; "
@@ -112,9 +126,10 @@ class ModelSettings(_Settings):
 class SlotineLiSettings(_Settings):
     """Adaptation of Theta (paper 3.2.2); per kind of parameter (J, b, B, C, tau_d)."""
 
-    Gamma: tuple[float, float, float, float, float] = Field(
-        (0.05, 0.5, 0.5, 0.5, 0.0),
-        description="Theta' = -Gamma Y_r' S_q; 0 leaves a kind where it starts",
+    Gamma: Joints = Field(
+        (0.04, 0.3, 0.3, 1.0, 0.0),
+        description="Theta' = -Gamma Y_r' S_q, as 5 values for all joints or 5 for each; 0 leaves "
+        "a parameter where it starts",
     )
     start: Literal["zero", "model"] = Field(
         "zero", description="Theta at power-on: nothing known, or controller.model"
@@ -220,3 +235,9 @@ class ControllerSettings(_Settings):
         links = len(self.model.links)
         if links != joints:
             raise ValueError(f"model.links has {links} entries, the arm has {joints} joints")
+        given, wanted = len(self.slotine_li.Gamma), (PER_JOINT, PER_JOINT * joints)
+        if given not in wanted:
+            raise ValueError(
+                f"slotine_li.Gamma has {given} entries; give {PER_JOINT}, or {wanted[1]} for "
+                f"{joints} joints"
+            )

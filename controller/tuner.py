@@ -52,12 +52,10 @@ class LoadMemoryGain(Gain):
         plateau = self._plateau_Nm
         S_abs = S if S >= 0.0 else -S
         if S_abs > self._knee_rad_s:
-            top = plateau / S_abs
+            top = max(low, plateau / S_abs)
         Kd = self._neutral + load / S if S_abs > 0.0 else self._neutral
-        if Kd > top:
-            Kd = top
-        if not Kd >= low:  # true of NaN, too
-            Kd = low
+        if not low <= Kd <= top:
+            Kd = top if Kd > top else low
         torque = Kd * S
         if not -plateau <= torque <= plateau:
             torque = plateau if torque > 0.0 else -plateau

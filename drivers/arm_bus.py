@@ -10,6 +10,8 @@ from drivers.frame import ERR_FLAG, pack_frame, unpack_frame, unpack_header
 SYNC_ID = 0x080
 HEARTBEAT_ID = 0x700
 RECEIVED, SENT = 0, 1
+OVERDUE_FRAMES = 100
+"""Queued frames still looked at during start-up when the time to wait for one is up."""
 
 FrameLog = Callable[[int, bytes], None]
 """Called with (RECEIVED or SENT, 16-byte record) for every frame, in the order seen."""
@@ -200,6 +202,7 @@ class _Port:
 
     def wait(self, can_id: int, timeout_s: float) -> bytes | None:
         deadline_ns = self._now_ns() + round(timeout_s * 1e9)
+        overdue = 0
         while True:
             remaining_ns = deadline_ns - self._now_ns()
             frame = self._bus.recv(max(0, remaining_ns) * 1e-9)
@@ -210,3 +213,7 @@ class _Port:
             got_id, data = unpack_frame(frame)
             if got_id == can_id:
                 return data
+            if remaining_ns <= 0:
+                overdue += 1
+                if overdue > OVERDUE_FRAMES:
+                    return None

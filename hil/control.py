@@ -11,6 +11,7 @@ from controller.errors import CommandError
 from controller.faults import FaultCode, Reaction
 from controller.limits import MotionGuard, TorqueLimiter
 from controller.machine import Machine, State, Trigger
+from controller.monitor import Monitor
 from controller.player import ReferencePlayer, Setpoint
 from controller.registry import make_law
 from controller.velocity import VelocityEstimator, make_estimator
@@ -63,6 +64,7 @@ class Control:
         machine: State and latched fault.
         player: The reference in force.
         law: The control law; its gains' bounds can be moved.
+        monitor: What the paper says of S, as of the last cycle in which the law ran.
         q_rad: Joint angles used in the last cycle.
         dq_rad_s: Joint rates used in the last cycle.
         tau_cmd_Nm: Torques the law requested in the last cycle.
@@ -78,6 +80,7 @@ class Control:
         self.machine = Machine()
         self.player = ReferencePlayer(n, config.loop.period_s)
         self.law = make_law(settings)
+        self.monitor = Monitor(settings.monitor, n)
         self.q_rad = [0.0] * n
         self.dq_rad_s = [0.0] * n
         self.tau_cmd_Nm = [0.0] * n
@@ -177,10 +180,12 @@ class Control:
             return self._damp() if self.machine.state is State.STOPPING else self._rest()
         self.tau_cmd_Nm = self.law.step(self.q_rad, self.dq_rad_s, setpoint, dt_s)
         try:
-            return self._limiter.step(self.tau_cmd_Nm, dt_s)
+            torques = self._limiter.step(self.tau_cmd_Nm, dt_s)
         except CommandError as error:
             self._trip(FaultCode.NOT_FINITE, detail=str(error))
             return self._rest()
+        self.monitor.step(self.law.S, self.law.Kd, torques, dt_s)
+        return torques
 
     def _violation(self, setpoint: Setpoint) -> FaultCode:
         if self._estimator is not None and not self._estimator.is_locked:
@@ -229,6 +234,7 @@ class Control:
         if self._bus.is_enabled:
             self._enabling_left = 0
             self.law.reset()
+            self.monitor.reset()
             self.fire(Trigger.POWERED)
             return True
         if self._enabling_left == 0:

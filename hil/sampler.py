@@ -47,6 +47,7 @@ class Sampler:
         control, law, axes = self._control, self._control.law, self._bus.axes
         number, t_ns, overruns = cycle
         machine, player, gains = control.machine, control.player, law.gains
+        monitor = control.monitor
         scalars = (
             self.seq,
             number,
@@ -57,6 +58,10 @@ class Sampler:
             overruns,
             *stamps,
             player.t_ref_s,
+            monitor.V_rad2_s2,
+            monitor.dissipation_W,
+            monitor.demand_W,
+            monitor.dissipation_W > monitor.demand_W,
         )
         setpoint = player.setpoint
         lists: tuple[Sequence[float], ...] = (
@@ -72,6 +77,11 @@ class Sampler:
             control.tau_cmd_Nm,
             control.tau_sent_Nm,
             [axis.tau_meas_Nm for axis in axes],
+            monitor.in_Omega_Kd,
+            monitor.entries,
+            monitor.exits,
+            monitor.tau_need_Nm,
+            monitor.S_bound_rad_s,
         )
         if self._truth is not None:
             lists += self._truth()

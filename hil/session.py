@@ -38,9 +38,18 @@ def open_session(settings: ZenohSettings) -> zenoh.Session:
             zenoh_config.insert_json5(key, json.dumps(value))
         return zenoh.open(zenoh_config)
     except zenoh.ZError as error:
-        endpoints = ", ".join([*settings.listen, *settings.connect])
-        reason = str(error).split(" at /")[0].rstrip(" [")
-        raise SessionError(f"Zenoh session ({endpoints}): {reason}") from error
+        raise SessionError(_explain(settings, str(error))) from error
+
+
+def _explain(settings: ZenohSettings, message: str) -> str:
+    if "Unable to connect" in message:
+        endpoints = ", ".join(settings.connect)
+        return f"nobody answers at {endpoints}; is `hil run` (or a Zenoh router) up there?"
+    endpoints = ", ".join([*settings.listen, *settings.connect])
+    if "in use" in message:
+        return f"Zenoh cannot listen at {endpoints}: address in use; set zenoh.listen to another"
+    reason = message.split(" at /")[0].rpartition('msg: "')[2].rstrip(" [")  # without its source
+    return f"Zenoh session ({endpoints}): {reason}"
 
 
 def client_settings(endpoints: Sequence[str]) -> ZenohSettings:

@@ -27,7 +27,9 @@ RECEIVED: Final = 0
 SENT: Final = 1
 _FIELDS: Final = fields_of(telemetry_pb2.Sample)
 _FIRST_TRUTH_FIELD: Final = 40  # fields from here on exist in simulation only
+_FIRST_MONITOR_FIELD: Final = 32  # of the per-joint ones
 _TRUTH_NAMES: Final = frozenset(f.name for f in _FIELDS if f.number >= _FIRST_TRUTH_FIELD)
+_OPTIONAL_NAMES: Final = frozenset(f.name for f in _FIELDS if f.number >= _FIRST_MONITOR_FIELD)
 
 
 class TelemetryError(HilError):
@@ -145,8 +147,8 @@ class SampleLayout:
                 are parsed.
 
         Returns:
-            One row per sample, columns as in `dtype`. Truth that the layout has and the sample
-            has not is NaN.
+            One row per sample, columns as in `dtype`. Truth, and per-joint monitors, that the
+            layout has and the sample has not are NaN.
 
         Raises:
             TelemetryError: If the bytes are not a batch, or have another number of joints.
@@ -178,7 +180,7 @@ class SampleLayout:
         entries: Sequence[float] = getattr(sample, name)
         if len(entries) == self.joints:
             return entries
-        if not entries and name in _TRUTH_NAMES:
+        if not entries and name in _OPTIONAL_NAMES:
             return [np.nan] * self.joints
         raise TelemetryError(
             f"sample {sample.seq}: {name} has {len(entries)} values, expected {self.joints}"

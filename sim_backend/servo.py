@@ -1,6 +1,7 @@
 """One servo axis behind an amplifier's protocol: RL winding, 2 kHz current loop, encoder."""
 
 import math
+from collections import deque
 
 from sim_backend.settings import ServoSettings
 
@@ -29,6 +30,7 @@ class Servo:
     __slots__ = (
         "_current_max_A",
         "_decay",
+        "_delayed_Nm",
         "_gain",
         "_integral_V",
         "_integral_gain",
@@ -58,6 +60,8 @@ class Servo:
         self.motor_rad_s = 0.0
         self.is_saturated = False
         self._integral_V = 0.0
+        periods = round(settings.command_delay_s / CURRENT_LOOP_PERIOD_S)
+        self._delayed_Nm = deque([0.0] * periods) if periods else None
         ratio = CURRENT_LOOP_PERIOD_S * settings.resistance_ohm / settings.inductance_H
         self._decay = math.exp(-ratio)  # of the winding current over one period, voltage held
         self._mean_weight = (1.0 - self._decay) / ratio
@@ -112,7 +116,11 @@ class Servo:
             self._integral_V = 0.0
             self.is_saturated = False
             return 0.0
-        demand_A = self.torque_target_Nm / self._torque_constant_Nm_A
+        target_Nm = self.torque_target_Nm
+        if self._delayed_Nm is not None:
+            self._delayed_Nm.append(target_Nm)
+            target_Nm = self._delayed_Nm.popleft()
+        demand_A = target_Nm / self._torque_constant_Nm_A
         limited_A = _clip(demand_A, self._current_max_A)
         before_A = self.current_A
         error_A = limited_A - before_A

@@ -160,6 +160,9 @@ class ServoSettings(_Settings):
     bandwidth_Hz: float = Field(250.0, gt=0, description="of the 2 kHz PI current loop")
     encoder_bits: int = Field(12, ge=8, le=24)
     encoder_offset_counts: int = Field(0, description="count read at joint angle zero")
+    command_delay_s: float = Field(
+        0.0, ge=0, le=0.1, description="from the torque demand to the current loop, in whole 500 us"
+    )
 
 
 class EmulatorSettings(_Settings):

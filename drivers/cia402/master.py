@@ -15,7 +15,11 @@ HIL_PRODUCT_CODE = 0x48494C31
 """1018:02 of the emulated drive; only there has 2F00 the meaning `time base`."""
 RESET_CYCLES = 10
 """Cycles for which the fault-reset edge is held."""
+HEARTBEATS_BEFORE_BOOT_UP = 8
+"""Heartbeats that may still arrive between a reset and the boot-up message."""
 RESTING_TORQUE = 0
+TORQUE_OBJECT_MAX = 0x7FFF
+"""Largest per mille that 6071 and 6077 hold."""
 _POWER_UP = {  # towards power: drive state -> controlword
     Cia402State.SWITCH_ON_DISABLED: codec.CONTROL_SHUTDOWN,
     Cia402State.READY_TO_SWITCH_ON: codec.CONTROL_SWITCH_ON,
@@ -58,6 +62,7 @@ class Cia402Axis(Axis):
 
     def configure(self, port: Port) -> AxisInfo:
         """Boot the node, check its scales, map its PDOs; see `Axis.configure`."""
+        self._refuse_torque_limit_out_of_range()
         sdo = SdoClient(port, self._settings.node_id, self.label, self._settings.sdo_timeout_s)
         self._refuse_if_enabled(sdo)
         self._boot(port)
@@ -74,6 +79,16 @@ class Cia402Axis(Axis):
         start = codec.pack_nmt(codec.NmtCommand.START, self._settings.node_id)
         port.send(codec.COB_NMT, start)
 
+    def _refuse_torque_limit_out_of_range(self) -> None:
+        s = self._settings
+        if not 1 <= self._torque_max <= TORQUE_OBJECT_MAX:
+            unit_Nm = s.rated_torque_Nm / 1000.0
+            raise AmplifierError(
+                f"{self.label}: torque_max_Nm {s.torque_max_Nm:g} is outside {unit_Nm:g} to "
+                f"{TORQUE_OBJECT_MAX * unit_Nm:g} Nm, what 6072 holds at rated_torque_Nm "
+                f"{s.rated_torque_Nm:g}; correct one of them"
+            )
+
     def _refuse_if_enabled(self, sdo: SdoClient) -> None:
         statusword = sdo.read_number(codec.U16, Index.STATUSWORD)
         if codec.decode_state(statusword) is Cia402State.OPERATION_ENABLED:
@@ -85,9 +100,19 @@ class Cia402Axis(Axis):
     def _boot(self, port: Port) -> None:
         node = self._settings.node_id
         port.send(codec.COB_NMT, codec.pack_nmt(codec.NmtCommand.RESET_COMMUNICATION, node))
-        if port.wait(codec.COB_HEARTBEAT + node, self._settings.sdo_timeout_s) is None:
+        if not self._sees_boot_up(port):
             raise AmplifierError(f"{self.label}: no boot-up message after a communication reset")
         port.send(codec.COB_NMT, codec.pack_nmt(codec.NmtCommand.ENTER_PRE_OPERATIONAL, node))
+
+    def _sees_boot_up(self, port: Port) -> bool:
+        can_id = codec.COB_HEARTBEAT + self._settings.node_id
+        for _ in range(HEARTBEATS_BEFORE_BOOT_UP):
+            data = port.wait(can_id, self._settings.sdo_timeout_s)
+            if data is None:
+                return False
+            if codec.parse_heartbeat(data) is codec.NmtState.INITIALISING:
+                return True
+        return False
 
     @staticmethod
     def _read_name(sdo: SdoClient) -> str:
@@ -141,6 +166,12 @@ class Cia402Axis(Axis):
         sdo.write(Index.CONSUMER_HEARTBEAT, 1, codec.U32.pack(watch))
         found = sdo.read_number(codec.U16, Index.MAX_TORQUE)
         self._require("torque limit 6072 [per mille]", found, self._torque_max, "torque_max_Nm")
+        mode = sdo.read_number(codec.I8, Index.MODE_DISPLAY)
+        if mode != codec.CST:
+            raise AmplifierError(
+                f"{self.label}: mode of operation 6061 is {mode}, although 6060 was set to "
+                f"{codec.CST}; let the drive be controlled over CANopen"
+            )
 
     def _map_pdos(self, sdo: SdoClient) -> None:
         node = self._settings.node_id
@@ -196,6 +227,7 @@ class Cia402Axis(Axis):
         if self._heartbeat_age > self._heartbeat_limit and self.status is not AxisStatus.LOST:
             self.status = AxisStatus.LOST
             self.note = f"{self.label}: no heartbeat for {self._heartbeat_age} cycles"
+            self.disable()
 
     def inject_fault(self) -> bytes:
         """SDO write to 2F01, which only the emulated drive has; a real one refuses it."""
@@ -242,8 +274,11 @@ class Cia402Axis(Axis):
                 self._statusword = -1
                 return
             self.status = AxisStatus.FAULT
+            self._wants_power = False
             self.note = self.note or f"{self.label}: drive fault (statusword {statusword:04X})"
         else:
+            if self.status is AxisStatus.ENABLED:  # power went off: only `enable` may ask again
+                self._wants_power = False
             self.status = AxisStatus.DISABLED
         self._choose_controlword()
 
@@ -272,6 +307,7 @@ class Cia402Axis(Axis):
             self.status = AxisStatus.LOST
             self.note = f"{self.label}: restarted by itself (boot-up message)"
             self._heartbeat_age = self._heartbeat_limit + 1
+            self.disable()
         return False
 
     def _on_emcy(self, frame: bytes) -> bool:

@@ -61,8 +61,8 @@ class HilProcess:
     def __init__(self, directory, *arguments, launcher=(), cwd=None, **environment):
         self.directory = Path(directory)
         number = len(list(self.directory.glob("*.stderr")))
-        stem = self.directory / f"{number}-{arguments[0]}"
-        self.stdout_path, self.stderr_path = stem.with_suffix(".stdout"), stem.with_suffix(".stderr")
+        self.stdout_path = self.directory / f"{number}-{arguments[0]}.stdout"
+        self.stderr_path = self.stdout_path.with_suffix(".stderr")
         clean = {k: v for k, v in os.environ.items() if not k.startswith("HIL_")}
         with self.stdout_path.open("w") as out, self.stderr_path.open("w") as err:
             self.process = subprocess.Popen(
@@ -243,7 +243,6 @@ class Arm:
     def wait_until_at(self, t_ref_s, timeout_s=30.0):
         """Wait until the running motion is so far along."""
 
-
         def is_there():
             assert self.state is not State.FAULT, list(self.events)
             return self.state is State.ACTIVE and self.now["t_ref_s"] >= t_ref_s
@@ -361,3 +360,16 @@ def whole(path):
     assert not recording.is_truncated
     assert np.array_equal(recording.samples["seq"], np.arange(len(recording.samples)))
     return recording
+
+
+def largest_jump(samples):
+    """Largest step of q_des and dq_des between neighbouring samples, over what a smooth one makes.
+
+    In a period of 1 ms a joint moves by dq * T + ddq * T^2 / 2 and gains ddq * T; the preset
+    allows 20 rad/s^2. Both quotients are 1 at most, with a tenth for rounding.
+    """
+    ddq_max, period_s = 22.0, 1e-3
+    q, dq = samples["q_des_rad"], samples["dq_des_rad_s"]
+    step_rad = np.abs(np.diff(q, axis=0) - dq[:-1] * period_s) / (ddq_max * period_s**2)
+    step_rad_s = np.abs(np.diff(dq, axis=0)) / (ddq_max * period_s)
+    return float(max(step_rad.max(), step_rad_s.max()))

@@ -13,9 +13,8 @@ from drivers.cia402.codec import COB_RPDO1, COB_SYNC, COB_TPDO1, TPDO1, Cia402St
 from drivers.cia402.codec import decode_state as decode
 from hil.client import RefusedError
 from hil.recording import Recording
-from tests.hil.lab import is_running, one_line, wait_until, whole
+from tests.hil.lab import is_running, largest_jump, one_line, wait_until, whole
 
-WATCHDOG_S = 0.2
 WALL = (
     # By the clock, lateness has consequences, and a busy host is late: a slow cycle with a law
     # that is soft enough for it, and watchdogs that a stall of a tenth of a second does not trip.
@@ -28,6 +27,8 @@ WALL = (
     *(f"axes.{j}.{key}" for j in (1, 2) for key in ("rpdo_timeout_ms=200", "heartbeat_ms=500")),
 )
 STALL_S = 0.5  # emulator.stall_timeout_s
+SPAN = 1500
+"""Samples after a kill in which its traces are looked for: the restart takes about a second."""
 
 
 def kill(arm, name):
@@ -87,7 +88,7 @@ def test_loop__killed_in_motion__drives_remove_torque_and_nothing_comes_back(lab
 
 
 def skips_within(samples, first, last):
-    """Periods skipped between two sample numbers, per thousand samples."""
+    """Periods skipped between two sample numbers."""
     part = samples[(samples["seq"] >= first) & (samples["seq"] < last)]
     return int(part["cycle"][-1] - part["cycle"][0]) - (len(part) - 1)
 
@@ -107,7 +108,7 @@ def test_gateway_and_recorder__killed_in_motion__loop_and_records_go_on_without_
         kills.append(arm.seq)
         kill(arm, name)
         wait_until(lambda n=name: arm.daemon.children().get(n, before[n]) != before[n], what=name)
-        wait_until(lambda: arm.seq > kills[-1] + 3000, what="telemetry three seconds on")
+        wait_until(lambda: arm.seq > kills[-1] + SPAN, what="telemetry after the kill")
     assert arm.daemon.children()["loop"] == before["loop"]
     for batches in (arm.rows(), np.concatenate(seen)):  # each sample once, across both gateways
         assert np.all(np.diff(batches["seq"].astype(int)) == 1)
@@ -126,12 +127,12 @@ def test_gateway_and_recorder__killed_in_motion__loop_and_records_go_on_without_
     samples = np.concatenate([first.samples, second.samples[new]])
     assert np.array_equal(samples["seq"], np.arange(len(samples)))
     # The loop skips periods when the host is busy; not more of them while the others restart.
-    span, total = 1500, skips_within(samples, 0, len(samples))
-    others = total - sum(skips_within(samples, k, k + span) for k in kills)
-    rate = others / (len(samples) - span * len(kills))
-    for k in kills:
-        assert skips_within(samples, k, k + span) <= span * (2 * rate + 0.25)
-    assert step_bound(samples) <= 1.0
+    near = [skips_within(samples, k, k + SPAN) for k in kills]
+    others = skips_within(samples, 0, len(samples)) - sum(near)
+    rate = others / (len(samples) - SPAN * len(kills))
+    assert max(near) <= SPAN * (2 * rate + 0.25)
+    powered = samples[np.isin(samples["state"], (State.READY, State.ACTIVE, State.HOLD))]
+    assert largest_jump(powered) <= 1.0
 
 
 def whole_from(path):
@@ -139,12 +140,6 @@ def whole_from(path):
     assert not recording.is_truncated
     assert np.all(np.diff(recording.samples["seq"].astype(int)) == 1)
     return recording
-
-
-def step_bound(samples):
-    """Largest step of q_des from sample to sample over what the desired rate explains."""
-    steps = np.abs(np.diff(samples["q_des_rad"], axis=0))
-    return float((steps / (2.0 * 1e-3 + np.abs(samples["dq_des_rad_s"][1:]) * 2e-3)).max())
 
 
 def test_supervisor__killed_in_motion__loop_stops_by_itself_and_no_process_is_left(lab):
@@ -219,5 +214,5 @@ def test_gateway__silent_for_seconds__policy_hold_slows_down_and_holds(lab):
     arm.wait_for(State.HOLD)
     wait_until(lambda: "GATEWAY_LOST" in str(arm.events), what="the event")
     assert arm.now["fault"] == 0
-    arm.swing()  # and it can be moved again
-    assert arm.daemon.end() == 0
+    arm.client.command("trajectory", kind="move", target_rad=[0.1, 0.1])
+    arm.wait_for(State.ACTIVE)

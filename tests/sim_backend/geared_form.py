@@ -8,23 +8,42 @@ solves them; each touch and each parting is an event at which it stops and start
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import tanh
+from math import cos, sin, tanh
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from sim_backend.settings import PlantSettings
-from tests.sim_backend.closed_form import Chain, Motion
+from tests.sim_backend.closed_form import Motion, TwoLink
 
 FREE, UPPER, LOWER = 0, 1, -1
 
 
-class GearedChain:
-    """n links, each driven by a rotor: M ddq + ... = f, J ddtheta + friction = tau - f."""
+class Pendulum:
+    """One link: (I + m lc^2) ddq + m g lc sin q + tau_f = tau."""
 
     def __init__(self, settings: PlantSettings) -> None:
-        self.links = Chain(settings)
-        self.n = self.links.n
+        (link,) = settings.links
+        self.inertia = link.inertia_kg_m2 + link.mass_kg * link.com_m**2
+        self.weight = settings.gravity_m_s2 * link.mass_kg * link.com_m
+        self.viscous, self.coulomb = link.viscous_Nms_rad, link.coulomb_Nm
+        self.d = settings.tanh_slope_s_rad
+
+    def acceleration(self, y: Motion, tau: Sequence[float]) -> tuple[float]:
+        q, v = y
+        friction = self.viscous * v + self.coulomb * tanh(self.d * v)
+        return ((tau[0] - friction - self.weight * sin(q)) / self.inertia,)
+
+    def energy_J(self, y: Motion) -> float:
+        return 0.5 * self.inertia * y[1] ** 2 - self.weight * cos(y[0])
+
+
+class GearedChain:
+    """One or two links, each driven by a rotor: M ddq + ... = f, J ddtheta + friction = tau - f."""
+
+    def __init__(self, settings: PlantSettings) -> None:
+        self.n = len(settings.links)
+        self.links = Pendulum(settings) if self.n == 1 else TwoLink(settings)
         self.gears = [link.drivetrain for link in settings.links]
         self.d = settings.tanh_slope_s_rad
 
@@ -96,6 +115,7 @@ def _solve_leg(
             "DOP853",
             dense_output=True,
             events=[event for event, _, _ in changes],
+            max_step=1e-3,  # in a longer one a light touch could come and go unseen
             rtol=1e-10,
             atol=1e-12,
         )
@@ -125,9 +145,14 @@ def _changes(
     return changes
 
 
-def _event(plant, j, side, *, rising):
+def _event(
+    plant: GearedChain, j: int, side: int, *, rising: bool
+) -> Callable[[float, np.ndarray], float]:
+    # A phase begins where the one before ended, at zero but for rounding: on the right side of it.
+    offset = 1e-10 if rising else -1e-10
+
     def event(_t: float, y: np.ndarray) -> float:
-        return plant.touch(j, y, side)
+        return plant.touch(j, y, side) - offset
 
     event.terminal, event.direction = True, 1.0 if rising else -1.0
     return event

@@ -162,3 +162,15 @@ def test_servo__any_targets_at_working_speed__torque_stays_below_the_peak(target
     for target_Nm in targets_Nm:
         servo.torque_target_Nm = target_Nm
         assert abs(servo.drive()) <= allowed_Nm + 1e-9
+
+
+def test_drive__command_delay__same_torque_later():
+    prompt = Servo(ServoSettings(torque_constant_Nm_A=1.0))
+    late = Servo(ServoSettings(torque_constant_Nm_A=1.0, command_delay_s=1e-3))
+    torques = []
+    for servo in (prompt, late):
+        servo.is_energised = True
+        servo.torque_target_Nm = 2.0
+        torques.append([servo.drive() for _ in range(20)])
+    assert torques[1][:2] == [0.0, 0.0]
+    assert torques[1][2:] == torques[0][:-2]
