@@ -65,17 +65,19 @@ class ReferencePlayer:
         self.setpoint = Setpoint(list(q_rad), zeros, zeros)
         self._end()
 
-    def start(self, rows: Sequence[float], samples: int) -> None:
+    def start(self, rows: Sequence[float], samples: int, ahead: int = 1) -> None:
         """Play a motion from its first row, which the next step returns.
 
         Args:
             rows: Flat doubles, `samples` rows of q, dq, ddq for all joints; kept, not copied.
             samples: Number of rows, at least 1.
+            ahead: Periods from now to the first row, at least 1. The next step is at least as
+                long; if it is longer, it returns the row that is due by then.
         """
         self._end()
         self._rows = rows
         self._last = samples - 1
-        self._phase = -1.0
+        self._phase = -float(ahead)
 
     def stop(self, ddq_max_rad_s2: Sequence[float]) -> None:
         """Slow down along the path, so that braking alone stays within these accelerations."""

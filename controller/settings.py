@@ -203,13 +203,14 @@ class ControllerSettings(_Settings):
 
     def warnings(self) -> list[str]:
         """Say what is allowed and not advised, one line each."""
-        found = []
-        if self.law.membership == "gaussian_clipped" and self.law.name.startswith("self_tuning"):
-            found.append(
-                "controller.law.membership gaussian_clipped: the sum (17) leaves the gain bounds "
-                "and is clipped, and torque falls where |S| grows; use gaussian_normalised"
-            )
-        return found
+        law = self.law
+        is_fuzzy = law.name.startswith("self_tuning") and law.tuner == "paper"
+        if not is_fuzzy or law.membership != "gaussian_clipped":
+            return []
+        return [
+            "controller.law.membership gaussian_clipped: the sum (17) leaves the gain bounds and "
+            "is clipped, and torque falls where |S| grows; use gaussian_normalised"
+        ]
 
     def require_joints(self, joints: int) -> None:
         """Check that every per-joint list has one entry per joint.

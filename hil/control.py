@@ -243,8 +243,10 @@ class Control:
         return False
 
     def _check_amplifiers(self) -> None:
-        if self._bus.is_enabled or self.machine.fault is not FaultCode.NONE:
+        if self._bus.is_enabled:
             return
+        if self.machine.fault is not FaultCode.NONE and not self.machine.state.is_powered:
+            return  # latched, and torque is off
         broken = self._bus.first_in(AxisStatus.FAULT)
         lost = self._bus.first_in(AxisStatus.LOST)
         dropped = self._bus.first_in(AxisStatus.DISABLED)
@@ -332,7 +334,7 @@ class Control:
             raise CommandError("the reference has changed since this trajectory was planned")
         if at_index is not None and at_index <= player.index:
             raise CommandError("the trajectory came too late to continue the running one")
-        player.start(rows, samples)
+        player.start(rows, samples, 1 if at_index is None else at_index - player.index)
         self.fire(Trigger.TRAJECTORY)
 
     def stop(self) -> None:

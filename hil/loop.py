@@ -83,6 +83,8 @@ class Loop:
                 "machine": f"{platform.machine()}, {os.cpu_count()} cores",
             },
         )
+        for warning in self._config.controller.warnings():
+            self._emit("warning", {"detail": warning})
         self._control.fire(Trigger.BUS_READY)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._end)

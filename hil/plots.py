@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.gain import memberships
+from controller.membership import MEMBERSHIPS
 from hil.decay import has_truth, noise_free_manifold
 from hil.fixed_protobuf import Records
 from hil.scenarios import COUNT_RAD
@@ -26,16 +26,16 @@ _STYLE: Final[Any] = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
 }
-_COLOURS: Final = (
+COLOURS: Final = (
     *("#1b6ca8", "#d1495b", "#2e933c", "#8f5aa8", "#b7791f", "#2a9d8f"),
     *("#6c757d", "#c2577f", "#5f7a1f", "#3f51b5", "#8d5524", "#111111"),
 )
 _DPI: Final = 110
 _MARGINS_IN: Final = (1.1, 0.7, 0.5, 0.35)  # left, right, bottom, top
 _BUCKETS: Final = 2000  # a line is drawn through the extremes of so many intervals
-_TRANSIENT_S: Final = 1.0
+TRANSIENT_S: Final = 1.0
 _S_SHOWN_rad_s: Final = 1.0
-_MOST_LEGEND_ENTRIES: Final = 4
+MOST_LEGEND_ENTRIES: Final = 4
 _HISTOGRAM_BINS: Final = 60
 _TRUTH_NOTE: Final = "Strong: the simulated plant itself. Pale: as measured, what the law works on."
 
@@ -76,7 +76,7 @@ class _Curves:
 
 
 @contextmanager
-def _canvas(size_in: tuple[float, float], path: Path) -> Iterator[Any]:
+def canvas(size_in: tuple[float, float], path: Path) -> Iterator[Any]:
     """Give an empty figure and write it to `path`, the same bytes for the same drawing.
 
     Margins are fixed: matplotlib's own layout search takes longer than the drawing.
@@ -154,8 +154,8 @@ def _draw_over_time(span: Span, curves: _Curves, path: Path) -> None:
     """Draw one row per joint: the whole run, its first second, its steady window."""
     joints = curves.values.shape[1]
     start_s, end_s = float(span.t_s[0]), float(span.t_s[-1])
-    windows_s = ((start_s, end_s), (start_s, start_s + _TRANSIENT_S), (span.steady_s, end_s))
-    with _canvas((11.0, 0.7 + 1.9 * joints), path) as figure:
+    windows_s = ((start_s, end_s), (start_s, start_s + TRANSIENT_S), (span.steady_s, end_s))
+    with canvas((11.0, 0.7 + 1.9 * joints), path) as figure:
         grid = figure.subplots(joints, len(windows_s), squeeze=False, width_ratios=(1.5, 1.0, 1.2))
         for axes, title in zip(grid[0], ("whole run", "start", "steady state"), strict=True):
             axes.set_title(title)
@@ -171,7 +171,7 @@ def _draw_over_time(span: Span, curves: _Curves, path: Path) -> None:
 
 
 def _draw_panel(axes: Any, t_s: Array, curves: _Curves, part: tuple[slice, int]) -> None:  # noqa: ANN401
-    colour = _COLOURS[part[1] % len(_COLOURS)]
+    colour = COLOURS[part[1] % len(COLOURS)]
     axes.margins(x=0.01)
     axes.locator_params(axis="y", nbins=5)
     if curves.pale is not None:
@@ -200,22 +200,25 @@ def thinned(t_s: Array, values: Array) -> tuple[Array, Array]:
     return t_s[chosen], values[chosen]
 
 
-def draw_gain_surface(beta: Sequence[float], rows: Records, folder: Path) -> Figure:
+def draw_gain_surface(
+    beta: Sequence[float], rows: Records, folder: Path, membership: str = "sigmoid"
+) -> Figure:
     """Draw memberships, linear consequences and Kd over |S| (figs 6, 7).
 
     Args:
         beta: Consequences of the rules big, medium, small, as configured.
         rows: Samples, whose (|S|, Kd) are drawn as dots on the curve.
         folder: Where the PNG file goes; it exists.
+        membership: A key of `controller.membership.MEMBERSHIPS`.
     """
     path = folder / "fig06_07_gain.png"
     s = np.linspace(0.0, _S_SHOWN_rad_s, 401)
-    degrees = np.array([memberships(float(value)) for value in s])
+    degrees = np.array([MEMBERSHIPS[membership](float(value)) for value in s])
     rules = ("big", "medium", "small")
-    with _canvas((9.0, 3.6), path) as figure:
+    with canvas((9.0, 3.6), path) as figure:
         left, right = figure.subplots(1, 2)
         for axes, scale in ((left, np.ones(3)), (right, np.asarray(beta))):
-            for rule, column, colour in zip(rules, (degrees * scale).T, _COLOURS[2:], strict=False):
+            for rule, column, colour in zip(rules, (degrees * scale).T, COLOURS[2:], strict=False):
                 axes.plot(s, column, color=colour, label=rule)
             axes.set(xlabel="|S| [rad/s]", xlim=(0.0, _S_SHOWN_rad_s))
         left.set(title="memberships", ylabel="degree")
@@ -232,9 +235,9 @@ def _draw_visited_gains(axes: Any, rows: Records) -> None:  # noqa: ANN401
     step = max(1, len(rows) // _BUCKETS)
     S, Kd = np.abs(rows["S_rad_s"][::step]), rows["Kd"][::step]
     for joint in range(S.shape[1]):
-        colour = _COLOURS[joint % len(_COLOURS)]
+        colour = COLOURS[joint % len(COLOURS)]
         shown = S[:, joint] <= _S_SHOWN_rad_s
-        label = f"joint {joint + 1}, run" if S.shape[1] <= _MOST_LEGEND_ENTRIES else None
+        label = f"joint {joint + 1}, run" if S.shape[1] <= MOST_LEGEND_ENTRIES else None
         axes.plot(S[shown, joint], Kd[shown, joint], ".", color=colour, markersize=2.5, label=label)
 
 
@@ -248,7 +251,7 @@ def draw_timing(samples: Records, period_us: float, folder: Path) -> Figure:
     """
     path = folder / "timing.png"
     figures = (("wake_late_ns", "wake-up after the scheduled start"), ("busy_ns", "busy time"))
-    with _canvas((9.0, 3.4), path) as figure:
+    with canvas((9.0, 3.4), path) as figure:
         for axes, (field, title) in zip(figure.subplots(1, 2), figures, strict=True):
             axes.set(xlabel=f"{title} [us]", ylabel="cycles")
             _draw_histogram(axes, np.maximum(samples[field] / 1e3, 1.0), period_us)

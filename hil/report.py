@@ -6,6 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from controller.settings import MODEL_BASED
 from hil.document import Block, Heading, Image, Paragraph, Table, write_document
 from hil.errors import HilError
 from hil.fixed_protobuf import Records
@@ -24,6 +25,7 @@ from hil.metrics import (
 )
 from hil.plots import Span, draw_gain_surface, draw_run, draw_timing
 from hil.recording import RecordedEvent, Recording
+from hil.region_report import manifold_section
 from hil.scenarios import SCENARIOS, Scenario
 
 _STEADY_SHARE: Final = 0.6
@@ -40,11 +42,16 @@ _FACTS: Final = {
     "lambda": "controller.law.lambda_",
     "Ki": "controller.law.Ki",
     "beta (big, medium, small)": "controller.law.beta",
+    "membership": "controller.law.membership",
 }
 _SELF_TUNING_REMARK: Final = (
     "The decay comes from Kd/H, not from the adaptation of beta: frozen, it is as fast. On"
     " tracking, self-tuning does not beat a constant Kd = Kd_max; it needs a fraction of the"
     " initial peak torque and has less torque chatter."
+)
+_MODEL_REMARK: Final = (
+    "This law is given the regressor of the arm: Y_r Theta carries the torque that the motion"
+    " needs, and S_q need not. It is as good as its model."
 )
 _LEVANT_REMARK: Final = (
     "At 12 bits Levant's differentiator costs about four times the error of a 30 Hz filtered"
@@ -115,6 +122,10 @@ def _blocks(recording: Recording, folder: Path) -> Iterator[Block]:
         yield from map(Paragraph, remarks(metrics, recording, scenario))
     yield Heading("Plots")
     yield from _plots(recording, metrics, folder)
+    if metrics is not None:
+        yield Heading("Regions and dissipation")
+        rows = trajectory_rows(recording.samples)
+        yield from manifold_section(rows, metrics.stat_start_s, recording.config, folder)
     yield Heading("Timing")
     yield from _timing(recording.samples, folder)
     yield Heading("Events")
@@ -196,7 +207,7 @@ def remarks(metrics: Metrics, recording: Recording, scenario: Scenario | None) -
         f" {_joined(S)} rad/s for a torque of {_joined(torque)} Nm. S_q can vanish only under a"
         " constant load."
     )
-    found = [offset]
+    found = [_MODEL_REMARK if law in MODEL_BASED else offset]
     if law.startswith("self_tuning"):
         found.append(_SELF_TUNING_REMARK)
     if _setting(recording.config, "controller.velocity.estimator") == "levant":
@@ -206,7 +217,7 @@ def remarks(metrics: Metrics, recording: Recording, scenario: Scenario | None) -
             f"This arm is not tracked (rms {_joined(metrics.measured.rms_counts)} counts). That is"
             " expected; the bounds of this scenario describe how it fails:" + _RANGE_REMARK
         )
-    elif max(torque) > _LIGHT_TORQUE_Nm:
+    elif max(torque) > _LIGHT_TORQUE_Nm and law not in MODEL_BASED:
         found.append("This run is outside the range of the published gains:" + _RANGE_REMARK)
     return found
 
@@ -231,8 +242,11 @@ def _plots(recording: Recording, metrics: Metrics | None, folder: Path) -> Itera
     figures = draw_run(span, folder)
     beta = _setting(recording.config, "controller.law.beta")
     law = str(_setting(recording.config, "controller.law.name") or "")
-    if isinstance(beta, list) and len(beta) == 3 and law.startswith("self_tuning"):
-        figures.append(draw_gain_surface(beta, span.rows, folder))
+    tuner = _setting(recording.config, "controller.law.tuner") or "paper"
+    is_fuzzy = law.startswith("self_tuning") and tuner == "paper"
+    if isinstance(beta, list) and len(beta) == 3 and is_fuzzy:
+        membership = _setting(recording.config, "controller.law.membership") or "sigmoid"
+        figures.append(draw_gain_surface(beta, span.rows, folder, membership))
     for figure in figures:
         yield Heading(figure.title, level=3)
         yield Image(figure.path, figure.title, figure.caption)

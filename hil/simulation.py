@@ -80,6 +80,8 @@ class Simulation:
         layout = SampleLayout(config.joints, with_truth=True)
         self._sampler = Sampler(layout, self.control, link, self._truth)
         self._sample = bytearray(layout.size)
+        for warning in config.controller.warnings():
+            self._emit("warning", {"detail": warning})
         self.control.fire(Trigger.BUS_READY)
         self._is_starting = False
 

@@ -168,8 +168,8 @@ class Arm(Chain):
         if self.is_held:
             self._held_ns += self._substeps * self._substep_ns
             return
-        self._advance(tau_Nm, self._substeps)
         try:
+            self._advance(tau_Nm, self._substeps)
             self._read_out()
         except ValueError as error:  # the cosine of an infinite angle
             raise PlantError(self._describe_damage(inf)) from error

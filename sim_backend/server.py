@@ -51,7 +51,7 @@ class EmulatorServer:
             self.serve(0.05 if self._emulator.is_lockstep else TICK_NS * 1e-9)
 
     def serve(self, timeout_s: float) -> None:
-        """Handle the frames at hand, waiting at most `timeout_s` for the first, and pass time on."""
+        """Handle the frames at hand, waiting `timeout_s` at most, and pass time on."""
         frames = self._wire.wait(timeout_s)
         if not self._emulator.is_lockstep:
             self._advance_by_clock()

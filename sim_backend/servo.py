@@ -61,7 +61,7 @@ class Servo:
         self.is_saturated = False
         self._integral_V = 0.0
         periods = round(settings.command_delay_s / CURRENT_LOOP_PERIOD_S)
-        self._delayed_Nm = deque([0.0] * periods) if periods else None
+        self._delayed_Nm = deque([0.0] * periods, maxlen=periods) if periods else None
         ratio = CURRENT_LOOP_PERIOD_S * settings.resistance_ohm / settings.inductance_H
         self._decay = math.exp(-ratio)  # of the winding current over one period, voltage held
         self._mean_weight = (1.0 - self._decay) / ratio
@@ -115,11 +115,13 @@ class Servo:
             self.current_A = 0.0
             self._integral_V = 0.0
             self.is_saturated = False
+            if self._delayed_Nm is not None:
+                self._delayed_Nm.extend([0.0] * len(self._delayed_Nm))
             return 0.0
         target_Nm = self.torque_target_Nm
         if self._delayed_Nm is not None:
-            self._delayed_Nm.append(target_Nm)
-            target_Nm = self._delayed_Nm.popleft()
+            target_Nm, newest_Nm = self._delayed_Nm[0], target_Nm
+            self._delayed_Nm.append(newest_Nm)  # pushes the oldest out
         demand_A = target_Nm / self._torque_constant_Nm_A
         limited_A = _clip(demand_A, self._current_max_A)
         before_A = self.current_A

@@ -195,11 +195,11 @@ class Cia402Axis(Axis):
     def command(self, tau_Nm: float) -> bytes:
         """RPDO1: controlword, and torque when the drive is enabled and is to stay so."""
         torque = RESTING_TORQUE
-        if self.status is AxisStatus.ENABLED and self._wants_power:
-            wanted = round(tau_Nm * self._per_mille_per_Nm)
-            torque = max(-self._torque_max, min(self._torque_max, wanted))
         if self._reset_cycles:
             self._step_reset()
+        elif self.status is AxisStatus.ENABLED and self._wants_power:
+            wanted = round(tau_Nm * self._per_mille_per_Nm)
+            torque = max(-self._torque_max, min(self._torque_max, wanted))
         return self._command_head + codec.RPDO1.pack(self._controlword, torque) + b"\0\0\0\0"
 
     def enable(self) -> None:

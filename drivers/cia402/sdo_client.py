@@ -52,18 +52,22 @@ class SdoClient:
             raise self._out_of_turn(answer, index, subindex)
         if answer.is_expedited:
             return answer.data
-        value, toggle = b"", 0
+        value, toggle, size = b"", 0, answer.size
         while len(value) <= VALUE_BYTES_MAX:
             answer = self._ask(sdo_upload_segment_request(toggle), index, subindex)
             if answer.kind is not SdoKind.UPLOAD_SEGMENT or answer.toggle != toggle:
                 raise self._out_of_turn(answer, index, subindex)
             value += answer.data
             toggle ^= 1
+            is_whole = size is None or len(value) == size
+            if not (is_whole if answer.is_last else answer.data):  # too short, too long, endless
+                raise self._out_of_turn(answer, index, subindex)
             if answer.is_last:
                 return value
         self._port.send(self._request_id, sdo_abort(index, subindex, SdoAbort.OUT_OF_MEMORY))
         raise AmplifierError(
-            f"{self._label}: object {index:04X}:{subindex:02X} is longer than {VALUE_BYTES_MAX} bytes"
+            f"{self._label}: object {index:04X}:{subindex:02X} is longer than "
+            f"{VALUE_BYTES_MAX} bytes"
         )
 
     def read_number(self, layout: Struct, index: int, subindex: int = 0) -> int:
@@ -121,6 +125,9 @@ class SdoClient:
                 f"{self._label}: object {index:04X}:{subindex:02X} refused: {reason}",
                 answer.abort_code,
             )
+        names_object = answer.kind in (SdoKind.UPLOAD, SdoKind.DOWNLOAD)
+        if names_object and (answer.index, answer.subindex) != (index, subindex):
+            raise self._out_of_turn(answer, index, subindex)
         return answer
 
     def _out_of_turn(self, answer: SdoFrame, index: int, subindex: int) -> AmplifierError:

@@ -2,6 +2,7 @@
 
 import math
 import random
+import re
 import struct
 
 import pytest
@@ -60,7 +61,8 @@ def test_configure__scale_contradicts_the_drive__both_values_and_the_setting_nam
 @pytest.mark.parametrize("peak_Nm", [163.9, 400.0, 1e6, 0.002])
 def test_configure__torque_limit_no_drive_can_hold__refused_with_the_range(peak_Nm):
     """6071 is a signed 16-bit per mille of the rated torque: 32.767 times it at the most."""
-    refused(rig_of(ask_for(ONE, torque_max_Nm=peak_Nm)), f"{LABEL}: torque_max_Nm {peak_Nm:g} ")
+    rig = rig_of(ask_for(ONE, torque_max_Nm=peak_Nm))
+    refused(rig, f"{LABEL}: torque_max_Nm {re.escape(f'{peak_Nm:g}')} is outside 0.005 to 163.8")
 
 
 def test_configure__largest_torque_limit_that_fits__accepted_and_clipped_to():

@@ -19,6 +19,7 @@ SUBSTEP_S = 500e-6
 SUBSTEPS = 2
 TANH_SLOPE_S_RAD = 50.0
 ACTIVE = 3
+BOUND_CYCLES = 2000
 BOX = ((1.0, 1.0), (4.0, 4.0))
 LAYOUT = SampleLayout(2, with_truth=True)
 
@@ -177,12 +178,35 @@ class Controller:
         return [list(column) for column in zip(*rows, strict=True)]
 
 
+class Monitors:
+    """Storage, dissipation, demand and regions, written out plainly; the bound is added later."""
+
+    def __init__(self) -> None:
+        self.need = [0.0, 0.0]
+        self.share = 1 - math.exp(-2 * math.pi * 5.0 * PERIOD_S)
+        self.inside: list[bool] = []
+        self.entries, self.exits = [0, 0], [0, 0]
+
+    def step(self, S, Kd, sent):
+        """Scalars and per-joint lists as they stand in a sample."""
+        inside = [abs(s) < 1.0 for s in S]
+        for j in (0, 1):
+            self.need[j] += self.share * (sent[j] - self.need[j])
+            if self.inside and inside[j] != self.inside[j]:
+                (self.entries if inside[j] else self.exits)[j] += 1
+        self.inside = inside
+        dissipation = Kd[0] * S[0] ** 2 + Kd[1] * S[1] ** 2
+        demand = abs(S[0] * self.need[0] + S[1] * self.need[1])
+        scalars = ((S[0] ** 2 + S[1] ** 2) / 2, dissipation, demand, dissipation > demand)
+        return scalars, (inside, self.entries, self.exits, self.need, (0.0, 0.0))
+
+
 def run(scenario: Scenario, law: Law | None = None, duration_s: float | None = None):
     """Samples of one run as the loop would report them, one row a cycle."""
     arm, gravity = ARMS[scenario.preset.split("_")[0]], scenario.preset.endswith("_v")
     acceleration = make_acceleration(arm, 9.81 if gravity else 0.0)
     count = 2 * math.pi / 2**scenario.encoder_bits if scenario.encoder_bits else 0.0
-    controller = Controller(scenario, law or Law())
+    controller, monitors = Controller(scenario, law or Law()), Monitors()
     state = (*scenario.q0_rad, 0.0, 0.0)
 
     def read(q: float) -> float:
@@ -213,9 +237,14 @@ def run(scenario: Scenario, law: Law | None = None, duration_s: float | None = N
             torque = end
         busy_ns = 110_000 + k % 97 * 500
         stamps = (60_000 + k % 13 * 1_000, 350_000, 390_000, 400_000, busy_ns)
-        head = (k, k, k * 1_000_000, ACTIVE, 0, 0, 0, *stamps, k * PERIOD_S)
-        motion = (q, dq, q_des, dq_des, S, sigma, Kd, *BOX, cmd, sent, torque)
+        scalars, lists = monitors.step(S, Kd, sent)
+        head = (k, k, k * 1_000_000, ACTIVE, 0, 0, 0, *stamps, k * PERIOD_S, *scalars)
+        motion = (q, dq, q_des, dq_des, S, sigma, Kd, *BOX, cmd, sent, torque, *lists)
         write(log, k * LAYOUT.size, head, (*motion, q_true, dq_true, mean))
+    rows = np.frombuffer(log, LAYOUT.dtype)
+    size = np.pad(np.abs(rows["S_rad_s"]), ((BOUND_CYCLES - 1, 0), (0, 0)))
+    trailing = np.lib.stride_tricks.sliding_window_view(size, BOUND_CYCLES, axis=0)
+    rows["S_bound_rad_s"] = trailing.max(axis=-1)
     return np.frombuffer(bytes(log), LAYOUT.dtype)
 
 

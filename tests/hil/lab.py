@@ -276,7 +276,7 @@ class Arm:
             center_rad=self.now["q_des_rad"].tolist(),
             amplitude_rad=list(amplitude_rad),
             frequency_Hz=[0.5, 0.5],
-            ramp_s=0.4,
+            ramp_s=0.5,
             approach=approach,
         )
         self.wait_until_at(0.5)

@@ -90,7 +90,8 @@ def test_export_csv__same_recording_twice__same_text(recording):
 def test_export_csv__unknown_state__its_number(tmp_path):
     layout, path = SampleLayout(1, with_truth=False), tmp_path / "run.mcap"
     buffer = bytearray(layout.size)
-    layout.writer()(buffer, 0, [1, 1, 1, 99, *[0] * 9], [[float("nan")] for _ in layout.list_names])
+    scalars = [1, 1, 1, 99, *[0] * (len(layout.scalar_names) - 4)]
+    layout.writer()(buffer, 0, scalars, [[float("nan")] for _ in layout.list_names])
     with RecordingWriter(path, {}, joints=1, with_truth=False) as writer:
         writer.add_sample(1, 1, bytes(buffer))
     row = exported(Recording.open(path)).splitlines()[1].split(",")

@@ -48,7 +48,7 @@ def record_made(path: Path, joints: int, cycles: int) -> Path:
     with RecordingWriter(path, {}, joints, with_truth=False) as writer:
         for k in range(cycles):
             lists = [[np.sin(0.1 * k + j) for j in range(joints)] for _ in layout.list_names]
-            write(buffer, 0, [k, k, k * 1_000_000, *[0] * 10], lists)
+            write(buffer, 0, [k, k, k * 1_000_000, *[0] * (len(layout.scalar_names) - 3)], lists)
             writer.add_sample(k * 1_000_000, k, bytes(buffer))
     return path
 

@@ -23,7 +23,9 @@ from hil.telemetry import (
 RANGES = {
     **dict.fromkeys(("seq", "cycle"), (0, 2**64 - 1)),
     "t_ns": (-(2**63), 2**63 - 1),
-    **dict.fromkeys(("state", "fault", "feedback_age_cycles", "overruns"), (0, 2**32 - 1)),
+    **dict.fromkeys(
+        ("state", "fault", "feedback_age_cycles", "overruns", "is_dissipating"), (0, 2**32 - 1)
+    ),
     **dict.fromkeys(
         ("wake_late_ns", "feedback_ns", "law_ns", "sent_ns", "busy_ns"), (-(2**31), 2**31 - 1)
     ),
@@ -63,9 +65,9 @@ def bits(values) -> list[bytes]:
 def test_writer__any_values__generated_class_reads_them_bit_for_bit(sample):
     layout, scalars, lists = sample
     message = telemetry_pb2.Sample.FromString(write(layout, scalars, lists))
-    *integers, t_ref_s = (getattr(message, name) for name in layout.scalar_names)
-    assert integers == scalars[:-1]
-    assert bits([t_ref_s]) == bits(scalars[-1:])
+    for name, value in zip(layout.scalar_names, scalars, strict=True):
+        read = getattr(message, name)
+        assert read == value if name in RANGES else bits([read]) == bits([value])
     for name, entries in zip(layout.list_names, lists, strict=True):
         assert bits(getattr(message, name)) == bits(entries)
     assert len(UnknownFieldSet(message)) == 0
@@ -105,7 +107,9 @@ def test_writer__offset__writes_only_its_slot():
     layout = SampleLayout(2, with_truth=False)
     buffer = bytearray(b"\xaa" * (3 * layout.size))
     lists = [[1.0, 2.0] for _ in layout.list_names]
-    layout.writer()(memoryview(buffer), layout.size, range(1, 14), lists)
+    layout.writer()(
+        memoryview(buffer), layout.size, range(1, len(layout.scalar_names) + 1), lists
+    )
     assert buffer[: layout.size] == buffer[2 * layout.size :] == b"\xaa" * layout.size
     assert telemetry_pb2.Sample.FromString(buffer[layout.size : 2 * layout.size]).busy_ns == 12
 
@@ -170,7 +174,7 @@ def test_decode_batch__batch_of_the_generated_class__same_values(sample):
 def test_batch__samples_of_a_layout__generated_class_reads_it():
     layout = SampleLayout(2, with_truth=True)
     lists = [[1.0, -2.0] for _ in layout.list_names]
-    batch = layout.batch([write(layout, [k] * 13, lists) for k in range(5)])
+    batch = layout.batch([write(layout, [k] * len(layout.scalar_names), lists) for k in range(5)])
     message = telemetry_pb2.SampleBatch.FromString(batch)
     assert [s.seq for s in message.samples] == [0, 1, 2, 3, 4]
     assert list(message.samples[4].tau_applied_Nm) == [1.0, -2.0]
@@ -184,7 +188,7 @@ def test_batch__sample_of_another_layout__refused():
 
 def test_decode__samples_of_mixed_size__all_read():
     layout = SampleLayout(1, with_truth=False)
-    own = write(layout, [3] * 13, [[1.0] for _ in layout.list_names])
+    own = write(layout, [3] * len(layout.scalar_names), [[1.0] for _ in layout.list_names])
     other = telemetry_pb2.Sample.FromString(own)
     other.seq = 0
     rows = layout.decode([own, other.SerializeToString()])
@@ -200,15 +204,29 @@ def test_decode_batch__nothing__no_rows():
 
 def test_decode_batch__sample_without_truth__truth_is_nan():
     with_truth, without = SampleLayout(2, with_truth=True), SampleLayout(2, with_truth=False)
-    own = write(without, [1] * 13, [[1.0, 2.0] for _ in without.list_names])
+    own = write(
+        without, [1] * len(without.scalar_names), [[1.0, 2.0] for _ in without.list_names]
+    )
     rows = with_truth.decode_batch(without.batch([own]))
     assert np.isnan(rows["q_true_rad"]).all()
     assert rows["q_meas_rad"].tolist() == [[1.0, 2.0]]
 
 
+def test_decode_batch__recording_without_monitors__read_with_the_monitors_missing():
+    layout = SampleLayout(2, with_truth=False)
+    scalars, lists = [1] * len(layout.scalar_names), [[1.0, 2.0] for _ in layout.list_names]
+    message = generated(layout, scalars, lists)
+    for field in ("V_rad2_s2", "in_Omega_Kd", "Omega_Kd_exits", "tau_need_Nm", "S_bound_rad_s"):
+        message.ClearField(field)
+    (row,) = layout.decode([message.SerializeToString()])
+    assert row["tau_meas_Nm"].tolist() == row["Omega_Kd_entries"].tolist() == [1.0, 2.0]
+    assert np.isnan([row["in_Omega_Kd"], row["tau_need_Nm"], row["S_bound_rad_s"]]).all()
+
+
 def test_decode_batch__other_number_of_joints__refused_with_field_and_numbers():
     three = SampleLayout(3, with_truth=False)
-    payload = three.batch([write(three, [1] * 13, [[1.0] * 3 for _ in three.list_names])])
+    scalars, lists = [1] * len(three.scalar_names), [[1.0] * 3 for _ in three.list_names]
+    payload = three.batch([write(three, scalars, lists)])
     with pytest.raises(TelemetryError, match="q_meas_rad has 3 values, expected 2"):
         SampleLayout(2, with_truth=False).decode_batch(payload)
 
@@ -288,5 +306,6 @@ def test_bus_frame_layout__can_fd_record__constant_size():
 def test_writer__nan_and_infinities__kept():
     layout = SampleLayout(3, with_truth=False)
     odd = [math.nan, math.inf, -math.inf]
-    rows = layout.decode([write(layout, [0] * 13, [odd for _ in layout.list_names])])
+    zeros = [0] * len(layout.scalar_names)
+    rows = layout.decode([write(layout, zeros, [odd for _ in layout.list_names])])
     assert bits(rows["Kd"][0]) == bits(odd)

@@ -6,6 +6,7 @@ from functools import cache
 from math import exp, inf, pi, sin
 
 from sim_backend.arm import Arm
+from sim_backend.perturbation import with_stribeck
 from sim_backend.presets import plant_preset
 from sim_backend.settings import PlantSettings
 from tests.sim_backend.closed_form import Motion, TwoLink, no_torque, solve, whole_ms
@@ -82,6 +83,7 @@ CASES = {
     "fast start": Case(SPIN, (0.0, 0.0, 12.0, -5.0), free, Errors(q_rad=1e-4), 1.0),
     "sine": Case(PELICAN, (0.0, 0.0, 0.0, 0.0), sine, Errors(q_rad=1e-4)),
     "pd": Case(PELICAN, OFFSET, pd((100, 15), (10, 1)), Errors(q_rad=1e-5, dq_rad_s=5e-4)),
+    "stribeck": Case(with_stribeck(PELICAN), (0.5, 0.0, 0.0, 0.0), free, Errors(q_rad=1e-5), 3.0),
     "light pd": Case(LIGHT, OFFSET, pd((60, 15), (1, 0.2)), Errors(dq_rad_s=1.5e-3)),
 }
 

@@ -128,6 +128,22 @@ class Chain:
         inertia = self.a * np.cos(angle[:, None] - angle[None, :]) + self.inertia
         return float(0.5 * rate @ inertia @ rate - self.g @ np.cos(angle))
 
+    def hold_torque(
+        self, y: np.ndarray, tau: Sequence[float], span_s: float, steps: int
+    ) -> np.ndarray:
+        """Return the motion after `span_s` under a constant torque, by RK4."""
+        h = span_s / steps
+
+        def slope(y: np.ndarray) -> np.ndarray:
+            return np.concatenate((y[self.n :], self.acceleration(y, tau)))
+
+        for _ in range(steps):
+            a = slope(y)
+            b = slope(y + 0.5 * h * a)
+            c = slope(y + 0.5 * h * b)
+            y = y + h / 6.0 * (a + 2.0 * (b + c) + slope(y + h * c))
+        return y
+
     def momentum_Nms(self, y: Motion) -> float:
         """Angular momentum about the shoulder: all absolute angles turn alike."""
         angle, rate = np.cumsum(y[: self.n]), np.cumsum(y[self.n :])

@@ -56,6 +56,19 @@ class EulerFriction(Arm):
             super()._advance_two(tau_Nm, 1)
 
 
+class EulerStribeck(Arm):
+    def _advance_optional(self, tau_Nm, substeps):
+        for _ in range(substeps):
+            self._rates_before = self.dq_rad_s
+            super()._advance_optional(tau_Nm, 1)
+
+
+class CoulombOnly(Arm):
+    def __init__(self, settings):
+        links = tuple(link.model_copy(update={"static_Nm": None}) for link in settings.links)
+        super().__init__(settings.model_copy(update={"links": links}))
+
+
 class FrozenFriction(Arm):
     def _advance_two(self, tau_Nm, substeps):
         loss = [
