@@ -29,31 +29,83 @@ FILTER = "controller.velocity:FilteredDifference.step"
 LEVANT = "controller.velocity:Levant.step"
 
 MUTANTS = (
-    Mutant("velocity error reversed", LAW, "dq_rad_s[j] - dq_des_rad_s[j]", "dq_des_rad_s[j] - dq_rad_s[j]"),
+    Mutant(
+        "velocity error reversed",
+        LAW,
+        "dq_rad_s[j] - dq_des_rad_s[j]",
+        "dq_des_rad_s[j] - dq_rad_s[j]",
+    ),
     Mutant("desired velocity forgotten", LAW, "dq_rad_s[j] - dq_des_rad_s[j]", "dq_rad_s[j]"),
-    Mutant("alpha of the other joint", LAW, "alpha * (q_rad[j]", "self._alpha[1 - j][0] * (q_rad[j]"),
+    Mutant(
+        "alpha of the other joint", LAW, "alpha * (q_rad[j]", "self._alpha[1 - j][0] * (q_rad[j]"
+    ),
     Mutant("integral term left out", LAW, "S_q + Ki * sigma_j", "S_q"),
     Mutant("integral term reversed", LAW, "S_q + Ki * sigma_j", "S_q - Ki * sigma_j"),
     Mutant("lambda forgotten", LAW, "f(self._lambda[j] * S_q)", "f(S_q)"),
-    Mutant("integral of S instead of S_q", LAW, "f(self._lambda[j] * S_q)", "f(self._lambda[j] * S_j * 20.0)"),
-    Mutant("rules big and small swapped", GAIN, "beta[BIG] * big + beta[MEDIUM] * medium + beta[SMALL] * small", "beta[SMALL] * big + beta[MEDIUM] * medium + beta[BIG] * small"),
+    Mutant(
+        "integral of S instead of S_q",
+        LAW,
+        "f(self._lambda[j] * S_q)",
+        "f(self._lambda[j] * S_j * 20.0)",
+    ),
+    Mutant(
+        "rules big and small swapped",
+        GAIN,
+        "beta[BIG] * big + beta[MEDIUM] * medium + beta[SMALL] * small",
+        "beta[SMALL] * big + beta[MEDIUM] * medium + beta[BIG] * small",
+    ),
     Mutant("rule medium left out", GAIN, "+ beta[MEDIUM] * medium ", "", "B"),
-    Mutant("gain constant at its maximum", GAIN, "return Kd if Kd < self.Kd_max else self.Kd_max", "return self.Kd_max"),
+    Mutant(
+        "gain constant at its maximum",
+        GAIN,
+        "return Kd if Kd < self.Kd_max else self.Kd_max",
+        "return self.Kd_max",
+    ),
     Mutant("signed S into the memberships", GAIN, "S if S >= 0.0 else -S", "max(S, 0.0)"),
-    Mutant("adaptation a thousand times too fast", "controller.gain:SelfTuningGain._adapt", "self._rate_per_s * dt_s", "1e3 * self._rate_per_s * dt_s"),
+    Mutant(
+        "adaptation a thousand times too fast",
+        "controller.gain:SelfTuningGain._adapt",
+        "self._rate_per_s * dt_s",
+        "1e3 * self._rate_per_s * dt_s",
+    ),
     Mutant("rate halved", FILTER, "(q - before) / dt_s", "0.5 * (q - before) / dt_s"),
-    Mutant("filter ten times too slow", FILTER, "self._rate_per_s * dt_s", "0.1 * self._rate_per_s * dt_s"),
+    Mutant(
+        "filter ten times too slow",
+        FILTER,
+        "self._rate_per_s * dt_s",
+        "0.1 * self._rate_per_s * dt_s",
+    ),
     Mutant("no filter", FILTER, "1.0 - math.exp(-self._rate_per_s * dt_s)", "1.0"),
     Mutant("Levant without the root", LEVANT, "math.sqrt(C * abs(error))", "C * abs(error)", "B"),
     Mutant("Levant's second gain tripled", LEVANT, "1.1 * C * sign", "3.3 * C * sign", "B"),
     Mutant("no Coulomb friction", PLANT, "- coulomb_1 * tanh(slope * rate)", ""),
     Mutant("no reaction on the first link", PLANT, "tau_1 - tau_2", "tau_1"),
-    Mutant("torque of the joints swapped", PLANT, "demand_1, demand_2 = tau_Nm", "demand_2, demand_1 = tau_Nm"),
-    Mutant("torque constant half", "sim_backend.servo:Servo.drive", "return mean_A * self._torque_constant_Nm_A", "return 0.5 * mean_A * self._torque_constant_Nm_A"),
-    Mutant("back-EMF ten times over", "sim_backend.servo:Servo.drive", "self._torque_constant_Nm_A * self.motor_rad_s", "10.0 * self._torque_constant_Nm_A * self.motor_rad_s"),
-    Mutant("encoder of the plant scaled", "sim_backend.servo:Servo.sense", "self.q_rad = q_rad", "self.q_rad = 0.99 * q_rad"),
-    Mutant("gravity missing", "sim_backend.chain:Chain._build", "(self.settings.gravity_m_s2, 0.0)", "(0.0, 0.0)", "E"),
-)  # fmt: skip
+    Mutant(
+        "torque of the joints swapped",
+        PLANT,
+        "demand_1, demand_2 = tau_Nm",
+        "demand_2, demand_1 = tau_Nm",
+    ),
+    Mutant(
+        "torque constant half",
+        "sim_backend.servo:Servo.drive",
+        "return mean_A * self._torque_constant_Nm_A",
+        "return 0.5 * mean_A * self._torque_constant_Nm_A",
+    ),
+    Mutant(
+        "encoder of the plant scaled",
+        "sim_backend.servo:Servo.sense",
+        "self.q_rad = q_rad",
+        "self.q_rad = 0.99 * q_rad",
+    ),
+    Mutant(
+        "gravity missing",
+        "sim_backend.chain:Chain._build",
+        "(self.settings.gravity_m_s2, 0.0)",
+        "(0.0, 0.0)",
+        "E",
+    ),
+)
 
 
 def apply(mutant: Mutant) -> None:

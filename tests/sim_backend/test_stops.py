@@ -45,7 +45,7 @@ def test_stop__battered__overshoot_is_within_one_substep(preset, substep_s):
 
 @pytest.mark.parametrize("count", [4, 7])
 def test_stop__longer_chain_battered__overshoot_is_within_one_substep(count):
-    overshoot, allowed, separation = batter(stopped(chain(count, 250e-6)), 1500)
+    overshoot, allowed, separation = batter(stopped(chain(count, 250e-6, 0.1)), 1500)
     assert 1e-5 < overshoot <= allowed
     assert separation < 1e-5
 
