@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-
 from drivers.axis import Axis
 from drivers.cia402.settings import Cia402Settings
 

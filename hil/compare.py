@@ -39,6 +39,7 @@ class CompareError(HilError):
 
 LAWS: Final[Mapping[str, Table]] = {
     REFERENCE: {"name": "self_tuning_pid"},
+    "load memory": {"name": "self_tuning_pid", "tuner": "load_memory"},
     "self-tuning pd": {"name": "self_tuning_pd"},
     "pid Kd=1": {"name": "pid", "Kd": [1.0, 1.0]},
     "pid Kd=4": {"name": "pid", "Kd": [4.0, 4.0]},
@@ -133,7 +134,7 @@ backlash: a gap of 2 mrad behind a rotor of 0.01 kg m2, encoder on the link.
 """
 
 QUICK: Final = (
-    (REFERENCE, "pid Kd=1", "pid Kd=4", CLIPPED, "computed torque", "slotine-li"),
+    (REFERENCE, "load memory", "pid Kd=1", "pid Kd=4", CLIPPED, "computed torque", "slotine-li"),
     ("bench_h kelly_4",),
     ("nominal", "friction x3", "load step"),
 )

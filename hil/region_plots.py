@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 _AVERAGE_CYCLES: Final = 100
 _LEAST: Final = (1e-3, 1e-5, 1e-5)  # what the logarithmic scales show of |S|, V and powers
+_SMALLEST: Final = 1e-12  # in place of zero
 _LABELS: Final = ("|S| [rad/s]", "V [rad2/s2]", "power [W]")
 _NOTE: Final = (
     f"Left every cycle of the start, right means over {_AVERAGE_CYCLES} cycles of the whole run."
@@ -51,11 +52,13 @@ def draw_manifold(span: Span, figures: ManifoldFigures, folder: Path) -> Figure:
         grid = figure.subplots(3, 2, squeeze=False, width_ratios=(1.0, 1.2))
         for row, lines, least, label in zip(grid, panels, _LEAST, _LABELS, strict=True):
             row[0].set_ylabel(label)
-            _draw(row[0], span.t_s, lines, least)
-            _draw(row[1], *_averaged(span.t_s, lines), least)
-            row[0].set_xlim(start_s, start_s + TRANSIENT_S)
-            row[1].set_xlim(start_s, end_s)
-            row[1].legend(loc="upper right")
+            _draw(row[0], span.t_s, lines, (start_s, start_s + TRANSIENT_S))
+            _draw(row[1], *_averaged(span.t_s, lines), (start_s, end_s))
+            for axes in row:
+                axes.set_yscale("log")
+                axes.set_ylim(least, max(10.0 * least, axes.get_ylim()[1]))
+            if lines[0].label is not None:
+                row[1].legend(loc="upper right")
         for axes in grid[0]:
             axes.axhline(OMEGA_KD_RAD_S, color="#6c757d", linestyle="--", linewidth=0.9)
         _draw_fits(grid[0, 0], figures)
@@ -107,17 +110,26 @@ def _averaged(t_s: Array, lines: Sequence[_Line]) -> tuple[Array, list[_Line]]:
     return mean(t_s), averaged
 
 
-def _draw(axes: Any, t_s: Array, lines: Sequence[_Line], least: float) -> None:  # noqa: ANN401
-    part = slice(0, int(np.searchsorted(t_s, t_s[0] + TRANSIENT_S, side="right")))
+def _draw(
+    axes: Any,  # noqa: ANN401 - matplotlib is untyped here
+    t_s: Array,
+    lines: Sequence[_Line],
+    window_s: tuple[float, float],
+) -> None:
+    part = slice(0, int(np.searchsorted(t_s, window_s[1], side="right")))
     for line in lines:
         if line.seen is not None:
-            seen = np.maximum(line.seen[part], least)
-            axes.plot(t_s[part], seen, color=line.colour, alpha=0.3, linewidth=0.6)
+            axes.plot(
+                t_s[part], _positive(line.seen[part]), color=line.colour, alpha=0.3, linewidth=0.6
+            )
     for line in lines:
-        t, values = thinned(t_s, np.maximum(line.values, least))
+        t, values = thinned(t_s[part], _positive(line.values[part]))
         axes.plot(t, values, color=line.colour, linewidth=0.9, label=line.label)
-    axes.set(yscale="log")
-    axes.set_ylim(bottom=least)
+    axes.set_xlim(*window_s)
+
+
+def _positive(values: Array) -> Array:
+    return np.maximum(values, _SMALLEST)
 
 
 def _draw_fits(axes: Any, figures: ManifoldFigures) -> None:  # noqa: ANN401

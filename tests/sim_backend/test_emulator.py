@@ -12,9 +12,10 @@ from sim_backend.arm import Arm
 from sim_backend.emulator import Emulator
 from sim_backend.errors import PlantError, SimError
 from sim_backend.node import AmplifierNode
+from sim_backend.perturbation import with_backlash
 from sim_backend.presets import plant_preset, servo_preset
 from sim_backend.servo import Servo
-from sim_backend.settings import ServoSettings
+from sim_backend.settings import DisturbanceSettings, PayloadSettings, ServoSettings
 
 SYNC = pack_frame(0x080)
 ENABLE, DISABLE = pack_frame(0x100, b"\x01"), pack_frame(0x100, b"\x00")
@@ -198,6 +199,55 @@ def test_arm_not_to_be_held__falls_from_the_start():
     for _ in range(50):
         rig.emulator.receive(SYNC)
     assert rig.arm.q_rad[0] < 0.39
+
+
+def backlash(encoder):
+    return with_backlash(plant_preset("bench_h", (0.4, -0.5)), 0.04, encoder).links
+
+
+@pytest.mark.parametrize("encoder", ["motor", "link"])
+def test_drivetrain__rotor_moves_in_its_gap__encoder_reads_its_side_and_truth_is_the_link(encoder):
+    rig = Rig(gravity_m_s2=0.0, links=backlash(encoder))
+    rig.emulator.receive(ENABLE)
+    rig.command(0.5, 0.0)
+    for _ in range(13):
+        rig.emulator.receive(SYNC)
+    at_encoder, q_motor_rad, rate = rig.servos[0].q_rad, rig.arm.q_motor_rad[0], rig.arm.dq_rad_s[0]
+    assert rig.emulator.q_true_rad == pytest.approx([0.4, -0.5], abs=1e-9)
+    assert q_motor_rad > 0.405
+    assert at_encoder == (q_motor_rad if encoder == "motor" else rig.arm.q_rad[0])
+    assert rig.servos[0].motor_rad_s == rig.arm.dq_motor_rad_s[0] > 0.5
+    assert rig.servos[0].dq_rad_s == (rig.servos[0].motor_rad_s if encoder == "motor" else rate)
+    for _ in range(60):
+        rig.emulator.receive(SYNC)
+    assert rig.emulator.q_true_rad[0] > 0.41
+    assert abs(rig.emulator.q_true_rad[0] - rig.arm.q_motor_rad[0]) > 1e-3
+
+
+def test_emulator__plant_by_call__payload_and_disturbance_reach_it():
+    rig, idle = Rig(), Rig()
+    rig.emulator.arm.pick_up(PayloadSettings(mass_kg=0.4))
+    rig.emulator.arm.disturb((0.0, 0.2))
+    for each in (rig, idle):
+        each.emulator.receive(ENABLE)
+        for _ in range(100):
+            each.emulator.receive(SYNC)
+    assert rig.emulator.q_true_rad != pytest.approx(idle.emulator.q_true_rad, abs=1e-3)
+
+
+def test_held_arm__schedule__begins_when_the_arm_is_let_go():
+    step = DisturbanceSettings(joint=1, torque_Nm=0.5, start_s=0.02)
+    rig = Rig(gravity_m_s2=0.0, disturbances=(step,))
+    for _ in range(100):
+        rig.emulator.receive(SYNC)
+    rig.emulator.receive(ENABLE)
+    rig.command(0.0, 0.0)
+    for _ in range(20):
+        rig.emulator.receive(SYNC)
+    assert rig.arm.q_rad == pytest.approx([0.4, -0.5], abs=1e-9)
+    for _ in range(30):
+        rig.emulator.receive(SYNC)
+    assert rig.arm.q_rad[0] > 0.401
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,15 @@ def test_servo__constant_rate__back_emf_is_overcome(dq_rad_s):
     assert servo.torque_Nm == pytest.approx(3.0, abs=1e-6)
 
 
+def test_servo__encoder_on_the_link__back_emf_is_of_the_rotor():
+    on_link, on_motor = energised(3.0), energised(3.0)
+    on_link.sense(0.1, 0.0, 6.0)
+    on_motor.sense(0.2, 6.0)
+    assert (on_link.dq_rad_s, on_link.motor_rad_s, on_motor.motor_rad_s) == (0.0, 6.0, 6.0)
+    assert on_link.drive() == on_motor.drive() != energised(3.0).drive()
+    assert on_link.counts != on_motor.counts
+
+
 def test_servo__one_period__mean_torque_is_the_integral_of_the_winding_equation():
     servo = energised(4.0)
     servo.sense(0.0, 2.0)
