@@ -58,7 +58,7 @@ def draw_manifold(span: Span, figures: ManifoldFigures, folder: Path) -> Figure:
                 axes.set_yscale("log")
                 axes.set_ylim(least, max(10.0 * least, axes.get_ylim()[1]))
             if lines[0].label is not None:
-                row[1].legend(loc="upper right")
+                row[1].legend(loc="lower right")
         for axes in grid[0]:
             axes.axhline(OMEGA_KD_RAD_S, color="#6c757d", linestyle="--", linewidth=0.9)
         _draw_fits(grid[0, 0], figures)

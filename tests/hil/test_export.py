@@ -22,6 +22,14 @@ JOINT_COLUMNS = [
 ]
 TRUTH_COLUMNS = ["q_true_{}_rad", "dq_true_{}_rad_s", "tau_applied_{}_Nm"]
 STAMPS = ["wake_late_ns", "feedback_ns", "law_ns", "sent_ns", "busy_ns"]
+MONITORS = ["V_rad2_s2", "dissipation_W", "demand_W", "is_dissipating"]
+MONITOR_COLUMNS = [
+    "in_Omega_Kd_{}",
+    "Omega_Kd_entries_{}",
+    "Omega_Kd_exits_{}",
+    "tau_need_{}_Nm",
+    "S_bound_{}_rad_s",
+]
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +62,15 @@ def empty(tmp_path, joints, with_truth) -> Recording:
 def test_export_csv__simulated_run__columns_of_the_design_with_truth(recording):
     header = exported(recording).split("\n", 1)[0].split(",")
     per_joint = columns_of(2, JOINT_COLUMNS + TRUTH_COLUMNS)
-    assert header == ["t_s", "cycle", "state", *per_joint, *STAMPS]
+    documented = ["t_s", "cycle", "state", *per_joint, *STAMPS]
+    assert header[: len(documented)] == documented
+    assert header[len(documented) :] == [*MONITORS, *columns_of(2, MONITOR_COLUMNS)]
 
 
 def test_export_csv__hardware_without_samples__header_alone(tmp_path):
     text = exported(empty(tmp_path, 6, with_truth=False))
-    assert (
-        text == ",".join(("t_s", "cycle", "state", *columns_of(6, JOINT_COLUMNS), *STAMPS)) + "\n"
-    )
+    documented = ("t_s", "cycle", "state", *columns_of(6, JOINT_COLUMNS), *STAMPS)
+    assert text == ",".join((*documented, *MONITORS, *columns_of(6, MONITOR_COLUMNS))) + "\n"
 
 
 def test_export_csv__every_value__reads_back_bit_for_bit(recording):
@@ -71,10 +80,13 @@ def test_export_csv__every_value__reads_back_bit_for_bit(recording):
         ("q_meas_2_rad", "q_meas_rad", 1),
         ("tau_applied_1_Nm", "tau_applied_Nm", 0),
         ("Kd_1", "Kd", 0),
+        ("tau_need_2_Nm", "tau_need_Nm", 1),
     ):
         values = np.array([float(row[name]) for row in rows])
         assert values.tobytes() == recording.samples[field][:, joint].tobytes()
     assert [int(row["busy_ns"]) for row in rows] == recording.samples["busy_ns"].tolist()
+    is_dissipating = recording.samples["is_dissipating"].tolist()
+    assert [int(row["is_dissipating"]) for row in rows] == is_dissipating
 
 
 def test_export_csv__clock_that_started_long_ago__time_counts_from_the_first_sample(recording):

@@ -13,7 +13,7 @@ from hil.recording import Recording, RecordingError, RecordingWriter
 from hil.report import ReportError, remarks, write_report
 from hil.scenarios import find_scenario
 from hil.telemetry import SampleLayout
-from tests.hil.closed_loop import payloads, run_named
+from tests.hil.closed_loop import PELICAN, payloads, run, run_named
 
 CONFIG = {
     "scenario": "A",
@@ -78,7 +78,7 @@ def test_write_report__scenario_run__says_that_S_does_not_vanish(scenario_report
 def test_write_report__scenario_run__every_plot_is_a_png_the_markdown_refers_to(scenario_report):
     folder, text = scenario_report.parent, scenario_report.with_suffix(".md").read_text()
     images = set(re.findall(r"!\[.*?\]\((.*?)\)", text))
-    assert images == RUN_PLOTS | {"fig06_07_gain.png", "timing.png"}
+    assert images == RUN_PLOTS | {"fig06_07_gain.png", "regions.png", "timing.png"}
     for image in images:
         assert (folder / image).read_bytes().startswith(PNG)
 
@@ -86,8 +86,41 @@ def test_write_report__scenario_run__every_plot_is_a_png_the_markdown_refers_to(
 def test_write_report__html__needs_no_other_file(scenario_report):
     page = scenario_report.read_text()
     assert scenario_report.name == "report.html"
-    assert page.count("src=") == page.count('src="data:image/png;base64,') == 7
+    assert page.count("src=") == page.count('src="data:image/png;base64,') == 8
     assert '<td class="PASS">PASS</td>' in page
+
+
+def test_write_report__scenario_run__regions_decay_and_balance_with_and_without_the_plant(tmp_path):
+    arm, scenario = PELICAN, find_scenario("E")
+    links = [
+        {
+            "length_m": arm.length_m[j],
+            "com_m": arm.com_m[j],
+            "mass_kg": arm.mass_kg[j],
+            "inertia_kg_m2": arm.inertia_kg_m2[j],
+            "viscous_Nms_rad": arm.viscous_Nms_rad[j],
+            "coulomb_Nm": arm.coulomb_Nm[j],
+            "not_of_the_model": 1,
+        }
+        for j in (0, 1)
+    ]
+    plant = {"links": links, "gravity_m_s2": 9.81, "tanh_slope_s_rad": 50.0, "q0_rad": [0, 0]}
+    config = {**CONFIG, "scenario": None, "plant": plant}
+    rows = run(scenario, duration_s=3.0)
+    text = write_report(record(tmp_path / "e.mcap", config, rows), tmp_path)
+    section = text.with_suffix(".md").read_text().partition("## Regions and dissipation")[2]
+    assert "joint 1 leaves it 2 times" in section
+    assert re.search(r"\| decay \| 3\.\d+ \| 1\.\d+ \| 6\d\.\d% \| monitor \|", section)
+    found = re.search(r"\| decay \| 2\.\d+ \| 4\.\d+ \| (.*?)% \| plant's own", section)
+    assert found is not None
+    assert float(found[1]) < 15.0
+    law = {"law": {"name": "computed_torque"}}
+    rows = run_named("A")[:2000]
+    path = record(tmp_path / "c.mcap", {**CONFIG, "scenario": None, "controller": law}, rows)
+    section = write_report(path, tmp_path).with_suffix(".md").read_text()
+    assert "(36) is not its condition" in section
+    assert "monitor |" not in section
+    assert "S settles at" not in section
 
 
 def test_write_report__run_without_scenario__figures_without_verdict(tmp_path):
