@@ -1,4 +1,4 @@
-"""`python -m benchmarks.tuner`: the table of `docs/tuner.md`, some ten minutes on two cores.
+"""`python -m benchmarks.tuner`: the table of `docs/tuner.md`, a quarter of an hour.
 
 The load-memory tuner against the paper's and against the best constant gain: of the gains `GAINS`,
 each clipped to the tuner's own peak torque of the same case, for each joint the one with the

@@ -88,8 +88,11 @@ def run_in_simulation(
         Refusal: If the trajectory does not fit the arm.
         SimulationError: If the arm tripped; the recording shows how.
     """
-    with open_recording(config, path) as recording:
-        return play_in_simulation(config, request, recording, progress)
+    try:
+        with open_recording(config, path) as recording:
+            return play_in_simulation(config, request, recording, progress)
+    except SimulationError as error:
+        raise SimulationError(f"{error}; see {path}") from error
 
 
 def play_in_simulation(

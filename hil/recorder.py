@@ -12,7 +12,7 @@ from time import sleep
 
 from hil.errors import HilError
 from hil.process import outlast_loop
-from hil.realtime import die_with_parent
+from hil.realtime import die_with_parent, now_ns
 from hil.recording import RecordingWriter
 from hil.shared import SharedMemory
 
@@ -68,6 +68,7 @@ class Recorder:
         signal.signal(signal.SIGTERM, lambda number, _: signals.append(number))
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor decides
         while not signals:
+            self._shared.beat("recorder", now_ns())
             self.drain()
             sleep(DRAIN_EVERY_S)
         outlast_loop(self._shared, parent_pid, self.drain)

@@ -28,6 +28,7 @@ _CONFIG_SIZE = 64 << 10
 _EVENT_BYTES = 2048
 _STATUS_BYTES = 8192
 _CLOCK_MONOTONIC = 1
+_CHILDREN = ("loop", "gateway", "recorder")
 STATUS_EVERY_S: Final = 0.1
 """Period of the loop's status."""
 RING_S: Final = 8.0
@@ -200,7 +201,7 @@ class SharedMemory:
         self.commands = self._ring("commands")
         self._status = self._ring("status")
         self._estop = self._view("estop").cast("Q")
-        self._beats = {who: self._view(f"{who}.beat").cast("Q") for who in ("gateway", "loop")}
+        self._beats = {who: self._view(f"{who}.beat").cast("Q") for who in _CHILDREN}
 
     @classmethod
     def create(cls, config: Config) -> Self:
@@ -236,7 +237,7 @@ class SharedMemory:
     # Counters, each with one writer.
 
     def beat(self, who: str, t_ns: int) -> None:
-        """Note that `who` (`gateway`, `loop`) is alive at `t_ns` (CLOCK_MONOTONIC)."""
+        """Note that `who` (`loop`, `gateway`, `recorder`) is alive at `t_ns` (CLOCK_MONOTONIC)."""
         self._beats[who][0] = t_ns
 
     def last_beat(self, who: str) -> int:
@@ -288,7 +289,7 @@ def _plan(config: Config, sample_size: int, frame_size: int) -> dict[str, tuple[
         "commands": (_EVENT_BYTES, 64),
         "status": (_STATUS_BYTES, 4),
     }
-    words = ["estop", "gateway.beat", "loop.beat", "loop.commands"]
+    words = ["estop", "loop.commands", *(f"{who}.beat" for who in _CHILDREN)]
     words += [f"{who}.{part}" for who in ("gateway", "recorder") for part in ("samples", "events")]
     words += ["recorder.frames"]
     plan: dict[str, tuple[int, ...]] = {}

@@ -139,7 +139,7 @@ class Supervisor:
         return self._recording.with_stem(f"{self._recording.stem}-{self._recordings}")
 
     def _await_start(self) -> int | None:
-        """Wait until loop and gateway show themselves.
+        """Wait until all children show themselves.
 
         Returns:
             The daemon's exit status if it is over before it has begun, else None.
@@ -149,18 +149,23 @@ class Supervisor:
         """
         deadline_s = monotonic() + START_TIMEOUT_S
         while not self._is_ended:
-            is_cycling = self._shared.status().get("samples", 0) >= START_SAMPLES
-            if is_cycling and self._shared.last_beat("gateway"):
+            silent = [name for name in self._children if not self._is_up(name)]
+            if not silent:
                 return None
             for name, child in self._children.items():
                 if child.status is not None:
                     self._explain(name, child.status)
                     return 1
             if monotonic() > deadline_s:
-                silent = "gateway" if is_cycling else "control loop"
-                raise RunError(f"the {silent} does not come up within {START_TIMEOUT_S:g} s")
+                raise RunError(f"the {silent[0]} does not come up within {START_TIMEOUT_S:g} s")
             sleep(WATCH_EVERY_S)
         return self._stop_loop()
+
+    def _is_up(self, name: str) -> bool:
+        if name == "loop":
+            cycles: int = self._shared.status().get("samples", 0)
+            return cycles >= START_SAMPLES
+        return self._shared.last_beat(name) > 0
 
     def _watch(self) -> int:
         """Return the daemon's exit status when it is over."""

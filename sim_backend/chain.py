@@ -14,15 +14,11 @@ from typing import Any, cast
 
 import pymunk
 
+from sim_backend.bodies import make_stops, place_body
 from sim_backend.drivetrain import Drivetrain, substep_refinement
 from sim_backend.errors import PlantError, SimError
 from sim_backend.friction import check_friction, free_mobilities, has_stribeck, make_friction
-from sim_backend.linkage import (
-    LinkMotion,
-    chain_energy_J,
-    link_motions,
-    outstretched_inertias_kg_m2,
-)
+from sim_backend.linkage import chain_energy_J, link_motions, outstretched_inertias_kg_m2
 from sim_backend.settings import LinkSettings, PlantSettings
 
 CURRENT_LOOP_PERIOD_NS = 500_000
@@ -126,11 +122,11 @@ class Chain:
         self._joints: list[pymunk.PivotJoint] = []
         before, anchor = space.static_body, (0.0, 0.0)
         for motion in link_motions(self._links, self.q_rad, self.dq_rad_s):
-            body, link = _place_body(motion), motion.link
+            body, link = place_body(motion), motion.link
             joint = pymunk.PivotJoint(before, body, anchor, (-link.com_m, 0.0))
             joint.error_bias = 0.0  # exactly: the whole error is corrected in one substep
             joint.collide_bodies = False
-            space.add(body, joint, *_make_stops(link, before, body))
+            space.add(body, joint, *make_stops(link, before, body))
             self._bodies.append(body)
             self._joints.append(joint)
             before, anchor = body, (link.length_m - link.com_m, 0.0)
@@ -270,35 +266,10 @@ def _differences(
     return differences
 
 
-def _place_body(motion: LinkMotion) -> pymunk.Body:
-    body = pymunk.Body(motion.link.mass_kg, motion.link.inertia_kg_m2)
-    body.angle, body.angular_velocity = motion.angle_rad, motion.rate_rad_s
-    body.position = (motion.x_m, motion.y_m)
-    body.velocity = (motion.vx_m_s, motion.vy_m_s)
-    return body
-
-
 def _make_drivetrain(link: LinkSettings, slope_s_rad: float, substep_s: float) -> Drivetrain | None:
     if link.drivetrain is None:
         return None
     return Drivetrain(link.drivetrain, slope_s_rad, substep_s)
-
-
-def _make_stops(
-    link: LinkSettings, before: pymunk.Body, body: pymunk.Body
-) -> list[pymunk.RotaryLimitJoint]:
-    """Return the joint's stops, if any.
-
-    They keep their default bias; with none, as the pivots have it, they rebound and chatter.
-    """
-    low, high = link.q_min_rad, link.q_max_rad
-    if low is None and high is None:
-        return []
-    stop = pymunk.RotaryLimitJoint(
-        before, body, -inf if low is None else low, inf if high is None else high
-    )
-    stop.collide_bodies = False
-    return [stop]
 
 
 def _substep_ns(settings: PlantSettings) -> int:

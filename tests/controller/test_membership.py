@@ -95,7 +95,7 @@ def test_membership__any_size__gain_stays_in_its_box(name, size, beta):
 @pytest.mark.parametrize("name", PARTITIONS)
 @given(size=ANY_SIZE | SIZE)
 def test_partition__any_size__sums_to_one(name, size):
-    assert sum(MEMBERSHIPS[name](size)) == pytest.approx(1.0, abs=3e-16)
+    assert sum(MEMBERSHIPS[name](size)) == pytest.approx(1.0, abs=5e-16)
 
 
 @given(size=SIZE)
@@ -183,7 +183,7 @@ def test_gaussian_clipped__far_away__Kd_min_whatever_big_says(beta):
 
 def test_gaussian_clipped__equal_consequences__not_a_constant_gain():
     Kd = [gain("gaussian_clipped", (2.0, 2.0, 2.0))(S) for S in (0.2, 0.4, 0.6)]
-    assert Kd == pytest.approx([2.003, 2.251, 2.003], abs=2e-3)
+    assert Kd == pytest.approx([2.006, 2.251, 2.006], abs=1e-3)
     assert max(np.diff(Kd)) > 0.2  # it rises, though no consequence does
 
 
@@ -206,9 +206,9 @@ def test_law__no_membership_named__sigmoid():
 
 
 def controller(**law) -> ControllerSettings:
-    names = ("q_min_rad", "q_max_rad", "dq_max_rad_s", "dq_trip_rad_s", "ddq_max_rad_s2")
-    names += ("dddq_max_rad_s3", "tau_max_Nm", "tau_slew_Nm_s", "following_error_rad")
-    limits = dict.fromkeys((*names, "damping_Nms_rad"), (1.0, 1.0))
+    names = ("q_max_rad", "dq_max_rad_s", "dq_trip_rad_s", "ddq_max_rad_s2", "dddq_max_rad_s3")
+    names += ("tau_max_Nm", "tau_slew_Nm_s", "following_error_rad", "damping_Nms_rad")
+    limits = dict.fromkeys(names, (1.0, 1.0)) | {"q_min_rad": (-1.0, -1.0)}
     return ControllerSettings(law=law, limits=limits)
 
 

@@ -147,14 +147,9 @@ def test_session__lost_and_back__subscription_goes_on(client, daemon, endpoint):
         again.session.close()
 
 
-@pytest.mark.parametrize(
-    ("bad", "words"),
-    [("nonsense", "Endpoints must be of the form"), ("tcp/127.0.0.1:1", "nobody answers at tcp/1")],
-)
-def test_client__endpoint_impossible__one_line(bad, words):
-    with pytest.raises(SessionError) as caught:
-        Client("other", [bad])
-    assert words in str(caught.value)
+def test_client__endpoint_malformed__one_line():
+    with pytest.raises(SessionError, match="Endpoints must be of the form") as caught:
+        Client("other", ["nonsense"])
     assert "\n" not in str(caught.value)
 
 

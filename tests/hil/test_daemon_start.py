@@ -50,14 +50,6 @@ def test_run__amplifier_silent__says_which(emulated):
     assert "joint 2 (cia402 node 9): no SDO answer" in one_line(daemon)
 
 
-def test_run__scale_contradicts_the_amplifier__says_setting_and_values(emulated):
-    daemon = start(emulated, "axes.1.rated_torque_Nm=4.0")
-    assert daemon.wait() == 1
-    line = one_line(daemon)
-    assert "rated torque 6076 [mNm] is 5000, the configuration says 4000" in line
-    assert "correct rated_torque_Nm" in line
-
-
 @pytest.mark.parametrize("place", ["file in the way", "not writable", "directory itself"])
 def test_run__recording_impossible__says_where(emulated, tmp_path, place):
     (tmp_path / "file").touch()
@@ -145,4 +137,4 @@ def test_send__no_daemon__one_line(tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     send = HilProcess(tmp_path, "send", "enable", "--connect", endpoint)
     assert send.wait() == 1
-    assert endpoint in one_line(send)
+    assert f"nobody answers at {endpoint}" in one_line(send)

@@ -125,6 +125,17 @@ def test_arm__two_links_by_the_general_path__same_bits():
     assert push(arm) == push(Arm(bench()))
 
 
+@pytest.mark.parametrize("preset", ["bench_v", "pelican_h", "light_v"])
+def test_arm__all_options_off_by_the_way_that_has_them__same_motion(preset):
+    plain, optional = (Arm(plant_preset(preset, (0.4, -0.5))) for _ in range(2))
+    optional._advance = optional._advance_optional
+    for k in range(400):
+        for arm in (plain, optional):
+            arm.step((1.5 - 0.01 * k, 0.7 * (-1) ** k), 500e-6)
+    assert optional.q_rad == pytest.approx(plain.q_rad, abs=1e-10)
+    assert optional.dq_rad_s == pytest.approx(plain.dq_rad_s, abs=1e-9)
+
+
 def test_arm__one_long_step_or_many_short__same_bits():
     long, short = Arm(bench()), Arm(bench())
     long.step((0.5, 0.2), 0.1)

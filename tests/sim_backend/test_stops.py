@@ -4,7 +4,9 @@ import random
 
 import pytest
 
+from sim_backend import chain as chain_module
 from sim_backend.arm import Arm
+from sim_backend.bodies import make_stops
 from sim_backend.perturbation import with_backlash
 from sim_backend.presets import plant_preset
 from sim_backend.settings import PlantSettings
@@ -50,16 +52,32 @@ def test_stop__longer_chain_battered__overshoot_is_within_one_substep(count):
     assert separation < 1e-5
 
 
-def test_stop__hit__takes_the_rate_and_does_not_rebound():
-    arm = Arm(stopped(plant_preset("bench_h", (0.9, 0.0))))
+def hit(arm: Arm) -> float:
+    """Run into a stop at 3 rad/s; return the lowest rate after that."""
     arm.reset((0.9, 0.0), (3.0, 0.0))
     energy_J, slowest = arm.energy_J(), 3.0
     for _ in range(300):
         arm.step((0.0, 0.0), 500e-6)
         slowest = min(slowest, arm.dq_rad_s[0])
         assert arm.energy_J() <= energy_J * (1.0 + 1e-6)
-    assert abs(slowest) < 0.05
+    return slowest
+
+
+def test_stop__hit__takes_the_rate_and_does_not_rebound():
+    arm = Arm(stopped(plant_preset("bench_h")))
+    assert -0.05 < hit(arm) < 0.05
     assert arm.q_rad[0] == pytest.approx(STOP_RAD, abs=3.0 * 250e-6)
+
+
+def test_stop__without_bias__rebounds(monkeypatch):
+    def make_unbiased_stops(*arguments):
+        stops = make_stops(*arguments)
+        for stop in stops:
+            stop.error_bias = 0.0
+        return stops
+
+    monkeypatch.setattr(chain_module, "make_stops", make_unbiased_stops)
+    assert hit(Arm(stopped(plant_preset("bench_h")))) < -1.0
 
 
 def test_stop__pressed__holds_the_torque():
