@@ -23,12 +23,21 @@ from hil.messages import KellyRequest
 from hil.metrics import MetricsError, measure
 from hil.planner import Refusal
 from hil.simulation import SimulationError
+from sim_backend.perturbation import (
+    scaled,
+    with_backlash,
+    with_load_step,
+    with_payload,
+    with_stribeck,
+)
+from sim_backend.settings import PlantSettings
 
 Table = Mapping[str, Any]
 DURATION_S: Final = 20.0
 STAT_START_S: Final = 12.0
 START_ERROR_RAD: Final = (0.4, -0.5)
 LOAD_STEP_Nm: Final = (0.3, 0.15)
+LOAD_STEP_S: Final = 14.0
 CLIPPED: Final = "pid Kd=4 clipped"
 REFERENCE: Final = "self-tuning pid"
 
@@ -62,41 +71,14 @@ SCENARIOS: Final[Mapping[str, tuple[str, float]]] = {
 Perturbation = Callable[[Config], Table]
 
 
-def _each_link(config: Config, change: Callable[[Any], Table]) -> Table:
-    links = {str(j): change(link) for j, link in enumerate(config.plant.links, start=1)}
-    return {"plant": {"links": links}}
+def _plant(change: Callable[[PlantSettings], PlantSettings]) -> Perturbation:
+    return lambda config: {"plant": change(config.plant).model_dump()}
 
 
-def _friction(config: Config) -> Table:
-    return _each_link(
-        config,
-        lambda link: {
-            "viscous_Nms_rad": 3.0 * link.viscous_Nms_rad,
-            "coulomb_Nm": 3.0 * link.coulomb_Nm,
-        },
-    )
-
-
-def _payload(config: Config) -> Table:
-    return {"plant": {"payloads": [{"mass_kg": 0.5 * config.plant.links[-1].mass_kg}]}}
-
-
-def _load_step(config: Config) -> Table:
-    del config
-    steps = [
-        {"joint": j, "torque_Nm": torque, "start_s": STAT_START_S + 2.0}
-        for j, torque in enumerate(LOAD_STEP_Nm, start=1)
-    ]
-    return {"plant": {"disturbances": steps}}
-
-
-def _stribeck(config: Config) -> Table:
-    return _each_link(config, lambda link: {"static_Nm": 1.5 * link.coulomb_Nm})
-
-
-def _backlash(config: Config) -> Table:
-    drivetrain = {"rotor_inertia_kg_m2": 0.01, "gap_rad": 0.002, "encoder": "link"}
-    return _each_link(config, lambda _: {"drivetrain": drivetrain})
+def _load_step(plant: PlantSettings) -> PlantSettings:
+    for joint, torque_Nm in enumerate(LOAD_STEP_Nm, start=1):
+        plant = with_load_step(plant, joint, torque_Nm, LOAD_STEP_S)
+    return plant
 
 
 def _encoder(bits: int) -> Perturbation:
@@ -117,12 +99,13 @@ def _delay(config: Config) -> Table:
 
 PERTURBATIONS: Final[Mapping[str, Perturbation]] = {
     "nominal": lambda _: {},
-    "friction x3": _friction,
-    "payload +50 %": _payload,
-    "load step": _load_step,
-    "Stribeck": _stribeck,
-    "backlash": _backlash,
+    "friction x3": _plant(lambda plant: scaled(plant, friction=3.0)),
+    "payload +50 %": _plant(lambda plant: with_payload(plant, 0.5)),
+    "load step": _plant(_load_step),
+    "Stribeck": _plant(lambda plant: with_stribeck(plant, 1.5)),
+    "backlash": _plant(lambda plant: with_backlash(plant, 0.002, "link", 0.01)),
     "encoder 10 bit": _encoder(10),
+    "encoder 14 bit": _encoder(14),
     "encoder 16 bit": _encoder(16),
     "delay +1 ms": _delay,
 }
@@ -312,7 +295,7 @@ COLUMNS: Final = (
 
 
 def to_markdown(rows: Sequence[Row]) -> str:
-    """Return one table per scenario and perturbation, joints side by side as `joint 1 / joint 2`."""
+    """Return one table per scenario and perturbation, joint 1 / joint 2."""
     lines: list[str] = []
     groups = dict.fromkeys((row.case.scenario, row.case.perturbation) for row in rows)
     for scenario, perturbation in groups:
