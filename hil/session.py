@@ -48,7 +48,8 @@ def _explain(settings: ZenohSettings, message: str) -> str:
     endpoints = ", ".join([*settings.listen, *settings.connect])
     if "in use" in message:
         return f"Zenoh cannot listen at {endpoints}: address in use; set zenoh.listen to another"
-    reason = message.split(" at /")[0].rpartition('msg: "')[2].rstrip(" [")  # without its source
+    message, _, _ = message.partition(" at /")  # the place in Zenoh's source
+    reason = message.rpartition('msg: "')[2].rstrip(" [")
     return f"Zenoh session ({endpoints}): {reason}"
 
 
