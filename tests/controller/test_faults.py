@@ -29,6 +29,10 @@ def test_fault_codes__all__have_a_reaction_and_are_known_here():
     assert {code.name for code in FaultCode} == set(EXPECTED)
 
 
+def test_fault_codes__numbers__are_those_of_recordings_and_telemetry():
+    assert [(code.value, code.name) for code in FaultCode] == list(enumerate(EXPECTED))
+
+
 @pytest.mark.parametrize("code", list(FaultCode), ids=lambda code: code.name)
 def test_reactions__every_code__as_designed(code):
     assert REACTIONS[code].name == EXPECTED[code.name]

@@ -2,6 +2,7 @@
 
 import math
 import sys
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.gain import ConstantGain, SelfTuningGain, memberships
-from controller.settings import LawSettings
+from controller.settings import LawSettings, MembershipName
 
 T = 1e-3
 ADAPTATIONS = ("off", "literal", "absolute", "true_sign")
@@ -125,9 +126,10 @@ def test_self_tuning_gain__next_to_zero__gain_of_zero(S):
     bounds=st.lists(st.floats(0.1, 8.0), min_size=2, max_size=2).map(sorted),
     beta=st.tuples(*[st.floats(-20.0, 20.0)] * 3),
     learning_rate=st.floats(0.0, 10.0),
+    membership=st.sampled_from(get_args(MembershipName)),
 )
 def test_self_tuning_gain__any_adaptation__gain_and_betas_stay_in_bounds(
-    S_values, adaptation, bounds, beta, learning_rate
+    S_values, adaptation, bounds, beta, learning_rate, membership
 ):
     low, high = bounds
     gain = tuned(
@@ -136,6 +138,7 @@ def test_self_tuning_gain__any_adaptation__gain_and_betas_stay_in_bounds(
         Kd_max=(high, high),
         beta=beta,
         learning_rate=learning_rate,
+        membership=membership,
     )
     for S in S_values:
         assert low <= gain.step(S, T) <= high
@@ -287,6 +290,16 @@ def test_self_tuning_gain__narrowed_and_widened__returns_to_the_same_surface(nar
             gain.step(0.3, T)
     after = [gain.step(S, T) for S in (0.0, 0.3, 0.5, 1.0)]
     assert after == pytest.approx(before, abs=1e-9)
+
+
+def test_self_tuning_gain__narrowed__the_surface_is_scaled_into_the_bounds():
+    gain, before = tuned(), tuned()
+    gain.set_bounds(2.0, 3.5)
+    for _ in range(300):
+        gain.step(0.3, T)
+    for S in (0.0, 0.2, 0.4, 0.7, 2.0):
+        place = (before.step(S, T) - 1.0) / 3.0
+        assert gain.step(S, T) == pytest.approx(2.0 + 1.5 * place, abs=1e-12)
 
 
 def test_self_tuning_gain__turned_round_mid_ramp__returns_to_the_same_surface():

@@ -119,6 +119,8 @@ CASES = [  # what a joint does, the verdict, the value and the limit it is repor
     ((2.0, 5.0, 1.5), FaultCode.NONE, None, None),
     ((-1.0, -5.0, -0.5), FaultCode.NONE, None, None),
     ((2.2, 0.0, 2.2), FaultCode.POSITION_HARD, 2.2, 2.1),
+    ((2.1, 0.0, 2.1), FaultCode.POSITION_SOFT, 2.1, 2.0),
+    ((-1.1, 0.0, -1.1), FaultCode.POSITION_SOFT, -1.1, -1.0),
     ((-1.2, 0.0, -1.2), FaultCode.POSITION_HARD, -1.2, -1.1),
     ((-1.2, 9.0, 3.0), FaultCode.POSITION_HARD, -1.2, -1.1),
     ((0.3, 5.1, 0.2), FaultCode.VELOCITY, 5.1, 5.0),
@@ -135,6 +137,12 @@ CASES = [  # what a joint does, the verdict, the value and the limit it is repor
 def judged(guard, *joints):
     """Check one (q, dq, q_des) per joint."""
     return guard.check(*(list(column) for column in zip(*joints, strict=True)))
+
+
+def test_motion_guard__new_or_nothing_wrong__names_no_joint():
+    guard = MotionGuard(settings())
+    assert judged(guard, INSIDE, INSIDE) is FaultCode.NONE
+    assert (guard.joint, guard.value, guard.limit) == (0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("joint", [1, 2])

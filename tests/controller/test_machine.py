@@ -68,6 +68,11 @@ def test_machine__every_state_and_trigger__as_the_table_says(state, trigger):
     assert machine.fault is FaultCode.NONE
 
 
+def test_state__numbers__are_those_of_recordings_and_telemetry():
+    names = ["INIT", "IDLE", "READY", "ACTIVE", "HOLD", "STOPPING", "FAULT", "ESTOP"]
+    assert [(state.value, state.name) for state in State] == list(enumerate(names))
+
+
 def test_machine__new__init_without_fault():
     assert (Machine().state, Machine().fault) == (State.INIT, FaultCode.NONE)
 

@@ -78,6 +78,13 @@ def same(setpoint, reference, row):
 # --- indexing ---------------------------------------------------------------------------------
 
 
+def test_player__new__rests_at_zero():
+    player = ReferencePlayer(2, T)
+    assert player.step(1) == ([0.0, 0.0], [0.0, 0.0], [0.0, 0.0])
+    assert player.t_ref_s == 0.0
+    assert not player.is_moving
+
+
 def test_player__new_or_holding__rests_at_the_pose():
     player = ReferencePlayer(2, T)
     player.hold([0.3, -0.2])

@@ -86,6 +86,14 @@ def test_filtered_difference__sine_at_the_cutoff__three_decibels():
 
 
 @pytest.mark.parametrize("make", [lambda: FilteredDifference(2, 30.0), levant])
+def test_estimator__new__at_rest_at_zero(make):
+    estimator = make()
+    assert estimator.dq_rad_s == [0.0, 0.0]
+    assert estimator.is_locked
+    assert estimator.step([0.0, 0.0], T) == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("make", [lambda: FilteredDifference(2, 30.0), levant])
 def test_estimator__reset__at_rest_and_nothing_of_the_past(make):
     used, fresh = make(), make()
     fed(used, lambda t: 3.0 * t, 50)

@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 
 from drivers.arm_bus import RECEIVED, SENT, ArmBus
-from drivers.axis import AxisStatus
+from drivers.axis import Axis, AxisStatus
 from drivers.buses.unix import UnixBus
 from drivers.cia402 import codec
 from drivers.cia402.codec import NmtCommand, NmtState
+from drivers.cia402.master import Cia402Axis
 from drivers.cia402.settings import Cia402Settings
 from drivers.errors import AmplifierError, BusError
 from drivers.frame import EFF_FLAG, ERR_FLAG, RTR_FLAG, pack_frame, unpack_frame
@@ -307,6 +308,15 @@ def test_collect__nothing_comes__gives_up_at_the_deadline():
     assert rig.clock_ns == begin_ns + 600_000
 
 
+def test_collect__deadline_passed_and_nothing_there__does_not_wait():
+    rig = configured()
+    rig.to_master = lambda _: []
+    rig.bus.request_feedback()
+    begin_ns = rig.clock_ns
+    assert not rig.bus.collect(begin_ns - T_NS)
+    assert rig.clock_ns == begin_ns
+
+
 def test_collect__deadline_passed_already__takes_what_is_there():
     rig = configured()
     rig.bus.request_feedback()
@@ -408,6 +418,17 @@ def test_inject_fault__emulated_drive__one_frame_in_the_next_cycle_and_the_drive
     assert not rig.servos[joint].is_energised
     assert rig.axes[joint].status is AxisStatus.FAULT
     assert rig.axes[1 - joint].status is AxisStatus.ENABLED
+
+
+def test_inject_fault__family_without_it__says_no_and_sends_nothing():
+    class Plain(Cia402Axis):
+        inject_fault = Axis.inject_fault
+
+    rig = configured()
+    rig.bus.axes[0] = Plain(SETTINGS[0], joint=1, period_s=1e-3)
+    assert not rig.bus.inject_fault(0)
+    rig.cycle()
+    assert not rig.sent(0x601)
 
 
 def test_inject_fault__both_axes_at_once__one_sdo_frame_a_cycle():

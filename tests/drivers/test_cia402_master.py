@@ -65,6 +65,12 @@ def test_configure__torque_limit_no_drive_can_hold__refused_with_the_range(peak_
     refused(rig, f"{LABEL}: torque_max_Nm {re.escape(f'{peak_Nm:g}')} is outside 0.005 to 163.8")
 
 
+def test_configure__smallest_torque_limit_that_fits__accepted():
+    rig = rig_of(ask_for(ONE, torque_max_Nm=0.005)).enable()
+    rig.cycles(2, 1e9)
+    assert rig.commands(1)[-1] == (codec.CONTROL_ENABLE_OPERATION, 1)
+
+
 def test_configure__largest_torque_limit_that_fits__accepted_and_clipped_to():
     rig = rig_of(ask_for(ONE, torque_max_Nm=5.0 * 32.767)).enable()
     rig.cycles(2, 1e9)
@@ -589,6 +595,17 @@ def test_heartbeat__back_after_loss__disabled_until_asked():
     assert rig.all_are("DISABLED")
     assert not rig.servos[0].is_energised
     rig.enable()
+
+
+def test_reset_fault__heartbeat_lost__a_new_chance_then_lost_again():
+    rig = rig_of().enable()
+    rig.to_master = without(HEARTBEAT)
+    rig.until(lambda: rig.all_are("LOST"))
+    rig.axes[0].reset_fault()
+    rig.cycles(250)
+    assert rig.all_are("DISABLED")
+    rig.cycles(60)
+    assert rig.all_are("LOST")
 
 
 def test_heartbeat__back_the_very_next_cycle__still_not_powered_on():
