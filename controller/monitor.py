@@ -37,8 +37,8 @@ class Monitor:
     """
 
     __slots__ = (
-        "V_rad2_s2",
         "S_bound_rad_s",
+        "V_rad2_s2",
         "_age_s",
         "_bucket_s",
         "_buckets",
@@ -104,8 +104,7 @@ class Monitor:
             size = s if s >= 0.0 else -s
             if size > newest[j]:
                 newest[j] = size
-                if size > bound[j]:
-                    bound[j] = size
+                bound[j] = max(bound[j], size)
             if (size < OMEGA_KD_RAD_S) != inside[j]:
                 self._cross(j)
         self.V_rad2_s2 = 0.5 * V

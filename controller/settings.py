@@ -6,9 +6,7 @@ from typing import Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Joints = tuple[float, ...]
-LawName = Literal[
-    "self_tuning_pid", "self_tuning_pd", "pid", "pd", "computed_torque", "slotine_li"
-]
+LawName = Literal["self_tuning_pid", "self_tuning_pd", "pid", "pd", "computed_torque", "slotine_li"]
 PER_JOINT = 5
 """Parameters per joint of the model-based laws: J, b, B, C, tau_d (`controller.model_based`)."""
 MODEL_BASED = ("computed_torque", "slotine_li")
@@ -207,10 +205,11 @@ class ControllerSettings(_Settings):
         is_fuzzy = law.name.startswith("self_tuning") and law.tuner == "paper"
         if not is_fuzzy or law.membership != "gaussian_clipped":
             return []
-        return [
-            "controller.law.membership gaussian_clipped: the sum (17) leaves the gain bounds and "
-            "is clipped, and torque falls where |S| grows; use gaussian_normalised"
-        ]
+        warning = (
+            "controller.law.membership gaussian_clipped: the sum (17) leaves the gain bounds and is"
+            " clipped, and torque falls where |S| grows; use gaussian_normalised"
+        )
+        return [warning]
 
     def require_joints(self, joints: int) -> None:
         """Check that every per-joint list has one entry per joint.

@@ -65,7 +65,7 @@ class LoopSettings(_Settings):
         0.6e-3, gt=0, description="after the start of a cycle; later feedback is missing"
     )
     lockstep_timeout_s: float = Field(
-        0.4, gt=0, description="the same for emulated amplifiers in lockstep, whose time waits"
+        1.0, gt=0, description="the same for emulated amplifiers in lockstep, whose time waits"
     )
     enable_timeout_s: float = Field(1.0, gt=0)
     on_gateway_loss: Literal["finish", "hold", "stop"] = Field(

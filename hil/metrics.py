@@ -185,7 +185,8 @@ def trajectory_rows(samples: Records) -> Records:
     if len(samples) == 0:
         raise MetricsError("the recording holds no samples: the loop never ran a cycle")
     t_s = samples["t_ref_s"]
-    breaks = np.flatnonzero((t_s[1:] <= 0.0) | (np.diff(t_s) <= 0.0)) + 1
+    # Where feedback is missing, the reference waits and its time is repeated: not the end of a run.
+    breaks = np.flatnonzero((t_s[1:] <= 0.0) | (np.diff(t_s) < 0.0)) + 1
     runs = np.split(np.arange(len(t_s)), breaks)
     longest = max(runs, key=lambda rows: float(t_s[rows[-1]] - t_s[rows[0]]))
     if t_s[longest[-1]] <= 0.0:

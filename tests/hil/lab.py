@@ -249,13 +249,25 @@ class Arm:
 
         wait_until(is_there, timeout_s, f"t_ref {t_ref_s} s")
 
+    def catch_up(self):
+        """Wait for the sample of a cycle that began after this call: telemetry takes its time."""
+        now_ns = time.monotonic_ns()
+        wait_until(lambda: self.now["t_ns"] >= now_ns, what="telemetry of this instant")
+
+    def state_now(self):
+        """The state after this call."""
+        self.catch_up()
+        return self.state
+
     def wait_cycles(self, cycles):
+        """Wait until so many cycles have been run from now on."""
+        self.catch_up()
         goal = self.seq + cycles
         wait_until(lambda: self.seq >= goal, what=f"{cycles} cycles")
 
     def make_ready(self):
         """Bring the arm to rest under power, whatever it is doing."""
-        self.wait_cycles(1)
+        self.catch_up()
         if self.state in (State.ESTOP, State.FAULT):
             self.client.command("reset")
             self.wait_for(State.IDLE)
@@ -264,10 +276,10 @@ class Arm:
             self.wait_for(State.HOLD)
         if self.state is State.IDLE:
             self.client.command("enable")
-            self.wait_cycles(1)
+            self.wait_for(State.READY)
         assert self.state in (State.READY, State.HOLD)
 
-    def swing(self, duration_s=8.0, amplitude_rad=(0.5, 0.4), approach="blend"):
+    def swing(self, duration_s=60.0, amplitude_rad=(0.5, 0.4), approach="blend"):
         """Start a long sinusoid about the present reference; return once it really moves."""
         self.client.command(
             "trajectory",

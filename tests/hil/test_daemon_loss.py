@@ -77,7 +77,7 @@ def test_loop__killed_in_motion__drives_remove_torque_and_nothing_comes_back(lab
     ready = again.daemon.stdout
     assert "FAULT (AMPLIFIER_FAULT)" in ready
     assert "reset" in ready
-    assert again.state is State.FAULT
+    assert again.state_now() is State.FAULT
     with pytest.raises(RefusedError, match="FAULT; reset first"):
         again.client.command("enable")
     again.client.command("reset")
@@ -100,7 +100,7 @@ def test_gateway_and_recorder__killed_in_motion__loop_and_records_go_on_without_
     seen = []
     other.on_telemetry(seen.append)
     arm.client.command("enable")
-    arm.swing(duration_s=20.0)
+    arm.swing()
     before = arm.daemon.children()
 
     kills = []
@@ -206,7 +206,7 @@ def test_gateway__silent_for_seconds__policy_hold_slows_down_and_holds(lab):
     lab.emulate()
     arm = lab.run('loop.on_gateway_loss="hold"')
     arm.client.command("enable")
-    arm.swing(duration_s=30.0)
+    arm.swing()
     gateway = arm.daemon.children()["gateway"]
     os.kill(gateway, signal.SIGSTOP)
     time.sleep(3.0)  # the loop gives it up after 2 s

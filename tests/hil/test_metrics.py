@@ -186,6 +186,12 @@ def test_trajectory_rows__first_sample_after_the_hold_is_at_one_period__hold_lef
     assert trajectory_rows(rows)["cycle"][0] == 100
 
 
+def test_trajectory_rows__reference_waits_for_missing_feedback__one_trajectory():
+    rows = made_rows(300)
+    rows["t_ref_s"] = np.concatenate((np.arange(100), [99, 99, 99], np.arange(100, 297))) * 1e-3
+    assert len(trajectory_rows(rows)) == 300
+
+
 def test_trajectory_rows__two_trajectories__the_longer():
     rows = made_rows(300)
     rows["t_ref_s"] = np.concatenate((np.arange(80), np.arange(220))) * 1e-3

@@ -107,9 +107,7 @@ def test_writer__offset__writes_only_its_slot():
     layout = SampleLayout(2, with_truth=False)
     buffer = bytearray(b"\xaa" * (3 * layout.size))
     lists = [[1.0, 2.0] for _ in layout.list_names]
-    layout.writer()(
-        memoryview(buffer), layout.size, range(1, len(layout.scalar_names) + 1), lists
-    )
+    layout.writer()(memoryview(buffer), layout.size, range(1, len(layout.scalar_names) + 1), lists)
     assert buffer[: layout.size] == buffer[2 * layout.size :] == b"\xaa" * layout.size
     assert telemetry_pb2.Sample.FromString(buffer[layout.size : 2 * layout.size]).busy_ns == 12
 
@@ -204,9 +202,7 @@ def test_decode_batch__nothing__no_rows():
 
 def test_decode_batch__sample_without_truth__truth_is_nan():
     with_truth, without = SampleLayout(2, with_truth=True), SampleLayout(2, with_truth=False)
-    own = write(
-        without, [1] * len(without.scalar_names), [[1.0, 2.0] for _ in without.list_names]
-    )
+    own = write(without, [1] * len(without.scalar_names), [[1.0, 2.0] for _ in without.list_names])
     rows = with_truth.decode_batch(without.batch([own]))
     assert np.isnan(rows["q_true_rad"]).all()
     assert rows["q_meas_rad"].tolist() == [[1.0, 2.0]]
