@@ -313,3 +313,15 @@ def test_stop__over__a_new_motion_runs_at_full_speed():
     for row in range(30):
         assert same(player.step(1), reference, row)
     assert not player.is_stopping
+
+
+def test_start__while_a_stop_is_under_way__replaces_it_at_full_speed():
+    reference, ddq_max = motion("fast_sine")
+    player = playing(reference, at=1500)
+    player.stop(ddq_max)
+    for _ in range(20):
+        player.step(1)
+    player.start(flat(reference), reference.samples)
+    assert not player.is_stopping
+    for row in range(30):
+        assert same(player.step(1), reference, row)
