@@ -125,7 +125,11 @@ class Control:
         self.feedback_ns = self._now_ns()
         self._take_feedback(is_fresh, periods)
         self._check_amplifiers()
-        torques = self._torques(periods)
+        try:
+            torques = self._torques(periods)
+        except CommandError as error:  # a torque that is not finite
+            self._trip(FaultCode.NOT_FINITE, detail=str(error))
+            torques = self._rest()
         self.law_ns = self._now_ns()
         self.tau_sent_Nm = torques
         self._bus.send_torques(torques)
@@ -179,11 +183,7 @@ class Control:
             self._trip(code, **self._explain(code))
             return self._damp() if self.machine.state is State.STOPPING else self._rest()
         self.tau_cmd_Nm = self.law.step(self.q_rad, self.dq_rad_s, setpoint, dt_s)
-        try:
-            torques = self._limiter.step(self.tau_cmd_Nm, dt_s)
-        except CommandError as error:
-            self._trip(FaultCode.NOT_FINITE, detail=str(error))
-            return self._rest()
+        torques = self._limiter.step(self.tau_cmd_Nm, dt_s)
         self.monitor.step(self.law.S, self.law.Kd, torques, dt_s)
         return torques
 
@@ -216,12 +216,13 @@ class Control:
         if self._age <= self._limits.n_hold:
             return self.tau_sent_Nm
         if self._age <= self._limits.n_hold + self._limits.n_damp:
-            return [
+            damped = [
                 0.0 if axis.age_cycles else -d * dq
                 for axis, d, dq in zip(
                     self._bus.axes, self._limits.damping_Nms_rad, self.dq_rad_s, strict=True
                 )
             ]
+            return self._limiter.step(damped, self._period_s)
         silent = next(axis for axis in self._bus.axes if axis.age_cycles)
         self._trip(FaultCode.FEEDBACK_LOST, detail=f"{silent.label}: silent for {self._age} cycles")
         return self._rest()
@@ -355,6 +356,7 @@ class Control:
         for axis in self._bus.axes:
             if axis.status in (AxisStatus.FAULT, AxisStatus.LOST):
                 axis.reset_fault()
+        self._has_feedback = False  # whatever spoilt the estimate is forgotten
         self.fire(Trigger.RESET)
 
     def set_gain_bounds(self, Kd_min: Sequence[float], Kd_max: Sequence[float]) -> None:

@@ -74,6 +74,7 @@ class HilProcess:
                 env=clean | {"TMPDIR": str(self.directory), **environment},
             )
         self.pid = self.process.pid
+        self._known = set()
 
     @property
     def stdout(self):
@@ -106,6 +107,7 @@ class HilProcess:
                 continue
             if parent == self.pid and b"hil.process" in words:
                 found[words[words.index(b"hil.process") + 1].decode()] = int(entry.name)
+        self._known.update(found.values())
         return found
 
     def wait(self, timeout_s=30.0):
@@ -120,7 +122,8 @@ class HilProcess:
 
     def close(self):
         """Leave nothing behind, whatever state the process is in."""
-        orphans = [] if self.process.poll() is not None else list(self.children().values())
+        if self.process.poll() is None:
+            self.children()
         if self.process.poll() is None:
             self.process.terminate()
             try:
@@ -128,7 +131,7 @@ class HilProcess:
             except subprocess.TimeoutExpired:
                 self.process.kill()
                 self.process.wait()
-        for pid in orphans:
+        for pid in self._known:
             if is_running(pid):
                 os.kill(pid, signal.SIGKILL)
 

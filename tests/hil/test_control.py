@@ -11,8 +11,9 @@ from drivers.axis import AxisStatus
 from drivers.cia402 import codec
 from drivers.cia402.codec import Cia402State, NmtCommand
 from drivers.errors import BusError
-from hil.config import ConfigError
+from hil.config import ConfigError, load_config
 from hil.control import AT_REST_RAD_S
+from hil.simulation import Simulation
 from tests.hil.virtual import Rig
 
 N_HOLD, N_DAMP = 5, 20
@@ -420,3 +421,16 @@ def test_nothing__enables_again_by_itself():
 def test_estimator__amplifier_that_reports_no_rate__refused_at_start():
     with pytest.raises(ConfigError, match=r"joint 1 .* reports no velocity"):
         Rig("controller.velocity.estimator=amplifier")
+
+
+def test_step__damping_with_a_rate_that_is_no_number__torque_off():
+    simulation = Simulation(load_config())
+    simulation.execute("enable")
+    simulation.run_until(State.READY, 100)
+    control = simulation.control
+    control.disable()
+    control._estimator.step = lambda *_: [np.nan, 0.0]
+    simulation.run(2)
+    assert control.machine.state is State.FAULT
+    assert control.machine.fault is FaultCode.NOT_FINITE
+    assert control.tau_sent_Nm == [0.0, 0.0]

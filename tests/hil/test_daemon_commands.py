@@ -1,8 +1,6 @@
 """Commands to one running daemon over Zenoh: what they do, and what is refused."""
 
 import json
-import threading
-import time
 
 import numpy as np
 import pytest
@@ -246,28 +244,6 @@ def test_estop__in_motion__torque_is_zero_within_two_cycles_and_latched(moving, 
     moving.client.command("reset")
     assert moving.state_now() is State.IDLE
     moving.client.command("enable")
-
-
-def test_estop__while_a_long_request_is_worked_on__waits_for_nobody(moving, shared_lab):
-    q = np.zeros((119_000, 2)) + moving.now["q_des_rad"]
-    request = {"kind": "samples", "period_s": 1e-3, "q_rad": q.tolist()}
-    payload = json.dumps(request)  # a second's work to read, plan and check
-    answers = []
-    with open_session(client_settings([shared_lab.endpoint])) as session:
-
-        def ask():
-            replies = session.get(f"hil/{shared_lab.arm}/cmd/trajectory", payload=payload)
-            answers.extend(json.loads(bytes(reply.ok.payload)) for reply in replies)
-
-        other = threading.Thread(target=ask)
-        other.start()
-        time.sleep(0.2)
-        moving.client.command("estop")
-        assert not answers
-        assert moving.state_now() is State.ESTOP
-        other.join()
-    assert not answers[0]["ok"]
-    assert "ESTOP" in answers[0]["reason"] or "stop" in answers[0]["reason"]
 
 
 def test_fault__injected_by_command__latches_with_its_detail_until_reset(moving, shared_lab):
