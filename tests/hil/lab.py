@@ -283,12 +283,17 @@ class Arm:
         assert self.state in (State.READY, State.HOLD)
 
     def swing(self, duration_s=60.0, amplitude_rad=(0.5, 0.4), approach="blend"):
-        """Start a long sinusoid about the present reference; return once it really moves."""
+        """Start a long sinusoid about the present reference; return once it really moves.
+
+        An arm that coasted towards a limit (emergency stop: nothing brakes it) comes back first.
+        """
+        room_rad = 1.2 if approach == "blend" else 2.8
+        center_rad = [max(-room_rad, min(room_rad, q)) for q in self.now["q_des_rad"].tolist()]
         self.client.command(
             "trajectory",
             kind="sinusoid",
             duration_s=duration_s,
-            center_rad=self.now["q_des_rad"].tolist(),
+            center_rad=center_rad,
             amplitude_rad=list(amplitude_rad),
             frequency_Hz=[0.5, 0.5],
             ramp_s=0.5,

@@ -23,7 +23,8 @@ HAMMER_S = 0.8
 
 @pytest.fixture(scope="module")
 def config():
-    return load_config(None, {"trajectory": {"max_duration_s": 2.0}})
+    """Small rings, so that they are lapped often."""
+    return load_config(None, {"trajectory": {"max_duration_s": 2.0}, "loop": {"period_s": 0.01}})
 
 
 @pytest.fixture
@@ -149,7 +150,8 @@ def _hammer(fd):
             struct.pack_into(f"<{words}Q", ring.memory, offset, *([number] * words))
             ring.commit()
             number += 1
-            shared.beat("loop", number)
+            for part in range(10):
+                shared.beat("loop", 10 * number + part)
         shared.post_status({"samples": number})
 
 
@@ -179,6 +181,10 @@ def test_ring__hammered_by_another_process__no_torn_record_and_nothing_unaccount
         beats = [before, *(shared.last_beat("loop") for _ in range(2000))]
         assert beats == sorted(beats)  # a word is whole at every instant, never zero in between
         before = beats[-1]
+        ring = shared.samples
+        for _ in range(500):  # where the writer is at work
+            record = ring.get(max(0, ring.head - ring.slots))
+            assert record is None or len(set(np.frombuffer(record, "<u8").tolist())) == 1
         assert shared.status().get("samples", 0) <= shared.samples.head
     writer.join()
     assert writer.exitcode == 0
