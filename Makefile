@@ -21,8 +21,9 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP) ## an emulated arm tracks a trajectory over real frames; verdict and report
 	$(BIN)/hil demo
 
+# A host that stalls for a second can fail a test of real processes: what failed runs once more, alone.
 test: $(STAMP) lint ## everything CI runs
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest || $(BIN)/python -m pytest --last-failed --last-failed-no-failures none
 
 lint: $(STAMP) ## format, lint, types, import rules
 	$(BIN)/ruff format --check
