@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from drivers.axis import Axis, AxisInfo, AxisStatus, FrameHandler
 from drivers.bus import Bus
 from drivers.errors import AmplifierError, BusError
-from drivers.frame import ERR_FLAG, pack_frame, unpack_frame, unpack_header
+from drivers.frame import EFF_MASK, ERR_FLAG, LOCKSTEP_ID, pack_frame, unpack_frame, unpack_header
 
 SYNC_ID = 0x080
 HEARTBEAT_ID = 0x700
@@ -48,6 +48,7 @@ class ArmBus:
         self._heartbeat_every = 0
         self._cycles_to_heartbeat = 0
         self._extra: list[bytes] = []
+        self._requesting = [a for a in self.axes if type(a).request is not Axis.request]
 
     def log_frames(self, log: FrameLog | None) -> None:
         """Have every frame reported from now on, or none."""
@@ -57,7 +58,7 @@ class ArmBus:
         """Set up every axis for cyclic torque; all end disabled.
 
         Args:
-            heartbeat_cycles: The master's own heartbeat is sent every so many cycles.
+            heartbeat_cycles: The master's own heartbeat is sent every so many cycles; 0 = never.
 
         Raises:
             AmplifierError: See `Axis.configure`, or if another master is at work on the bus.
@@ -72,14 +73,29 @@ class ArmBus:
         infos = [axis.configure(port) for axis in self.axes]
         if len({info.is_lockstep for info in infos}) > 1:
             raise AmplifierError("some axes run in lockstep and some by the clock; choose one")
+        if self._sync is None and infos[0].is_lockstep:
+            self._sync = pack_frame(LOCKSTEP_ID)
         for axis in self.axes:
             axis.start(port)
-            self._handlers.update(axis.handlers())
+            self._add_handlers(axis)
         return infos
 
+    def _add_handlers(self, axis: Axis) -> None:
+        for can_id, handler in axis.handlers().items():
+            if can_id in self._handlers:
+                raise AmplifierError(
+                    f"{axis.label}: identifier 0x{can_id & EFF_MASK:X} belongs to another axis too;"
+                    " give one of them another node id"
+                )
+            self._handlers[can_id] = handler
+
     def request_feedback(self) -> None:
-        """Begin a cycle: discard what came too late for the last one, then send SYNC."""
+        """Begin a cycle: discard what came too late for the last one, then ask, SYNC last."""
         self._drain()
+        for axis in self._requesting:
+            request = axis.request()
+            if request is not None:
+                self._send(request)
         if self._sync is not None:
             self._send(self._sync)
 
@@ -120,15 +136,17 @@ class ArmBus:
         axes = self.axes
         # Back to back: the first wakes who sleeps at the other end, the others come for free.
         for frame in [axis.command(tau) for axis, tau in zip(axes, tau_Nm, strict=True)]:
-            self._send(frame)
+            if frame is not None:
+                self._send(frame)
         for axis in axes:
             axis.end_cycle()
         if self._extra:
             self._send(self._extra.pop(0))
-        self._cycles_to_heartbeat -= 1
-        if self._cycles_to_heartbeat <= 0:
-            self._cycles_to_heartbeat = self._heartbeat_every
-            self._send(self._heartbeat)
+        if self._heartbeat_every:
+            self._cycles_to_heartbeat -= 1
+            if self._cycles_to_heartbeat <= 0:
+                self._cycles_to_heartbeat = self._heartbeat_every
+                self._send(self._heartbeat)
 
     def inject_fault(self, joint: int) -> bool:
         """Queue the frame that faults an emulated amplifier; False if the family has none."""

@@ -91,9 +91,21 @@ class Axis(ABC):
     def handlers(self) -> dict[int, FrameHandler]:
         """Identifiers of the frames this axis takes in operation, each with its handler."""
 
+    def request(self) -> bytes | None:
+        """Return the frame that asks for feedback at the start of a cycle, None if none is needed.
+
+        Families that answer a torque command with their state send the torque of the last
+        `command` here, so that feedback belongs to the start of the cycle and torque acts one
+        period after the feedback it was computed from, as with SYNC.
+        """
+        return None
+
     @abstractmethod
-    def command(self, tau_Nm: float) -> bytes:
+    def command(self, tau_Nm: float) -> bytes | None:
         """Return the frame to send in this cycle: torque if enabled, and power-state requests.
+
+        None if the family has nothing to send at the end of a cycle (see `request`). What takes
+        torque away is never put off to the next cycle.
 
         Args:
             tau_Nm: Joint torque, positive about the joint's axis, finite.

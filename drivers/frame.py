@@ -13,6 +13,9 @@ RTR_FLAG = 0x4000_0000  # remote request
 ERR_FLAG = 0x2000_0000  # error report of the controller, not a frame from the wire
 SFF_MASK = 0x0000_07FF
 EFF_MASK = 0x1FFF_FFFF
+LOCKSTEP_ID = EFF_FLAG | 0x1FFF_FFF0
+"""Identifier of the empty frame that ends a master's requests to emulated amplifiers in lockstep
+when no axis uses CANopen's SYNC: it advances emulated time. Never sent to real amplifiers."""
 FLAGS_INDEX = 3 if sys.byteorder == "little" else 0
 """Index of the record's byte that holds the flags: records are in the host's byte order."""
 ERR_BIT = ERR_FLAG >> 24

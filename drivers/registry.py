@@ -1,4 +1,4 @@
-"""Amplifier families by name: one line each. A family's code is imported when it is used."""
+"""Amplifier families by name: one line in each table. Code is imported when it is used."""
 
 from collections.abc import Sequence
 from importlib import import_module
@@ -6,11 +6,17 @@ from typing import Any
 
 from drivers.axis import Axis
 from drivers.cia402.settings import Cia402Settings
+from drivers.settings import AxisSettings
 
 AnyAxisSettings = Cia402Settings
 """Settings of any family, told apart by `family`."""
 
-_FAMILIES = {  # family -> "module:class" of its master side
+SETTINGS: dict[str, type[AxisSettings]] = {
+    "cia402": Cia402Settings,
+}
+"""Family -> its settings."""
+
+_MASTERS = {  # family -> "module:class" of its master side
     "cia402": "drivers.cia402.master:Cia402Axis",
 }
 
@@ -24,6 +30,12 @@ def make_axes(settings: Sequence[Any], *, period_s: float) -> list[Axis]:
     """
     axes = []
     for joint, axis in enumerate(settings, start=1):
-        module, _, name = _FAMILIES[axis.family].partition(":")
+        module, _, name = _MASTERS[axis.family].partition(":")
         axes.append(getattr(import_module(module), name)(axis, joint=joint, period_s=period_s))
     return axes
+
+
+def heartbeat_cycles(settings: Sequence[AxisSettings], *, period_s: float) -> int:
+    """Return after how many cycles the master's heartbeat is due, 0 if no axis listens for one."""
+    intervals_ms = [axis.master_heartbeat_ms for axis in settings if axis.master_heartbeat_ms]
+    return max(1, round(min(intervals_ms) * 1e-3 / period_s)) if intervals_ms else 0

@@ -20,8 +20,9 @@ from pydantic_settings import (
 
 from controller.settings import ControllerSettings, LinkModel, ModelSettings
 from drivers.bus import split_address
+from drivers.cia402.settings import Cia402Settings
 from drivers.errors import DriverError
-from drivers.registry import AnyAxisSettings
+from drivers.registry import SETTINGS, AnyAxisSettings
 from hil.errors import HilError
 from sim_backend.errors import SimError
 from sim_backend.presets import plant_preset, servo_preset
@@ -138,7 +139,9 @@ class Config(BaseSettings):
         arm = data.get("arm") or {}
         name = arm.get("preset", DEFAULT_PRESET) if isinstance(arm, Mapping) else DEFAULT_PRESET
         try:
-            return merge(preset_defaults(str(name)), data)
+            defaults = preset_defaults(str(name))
+            defaults["axes"] = _axes_of_families(defaults["axes"], data.get("axes"))
+            return merge(defaults, data)
         except SimError as error:
             raise ValueError(str(error)) from error
 
@@ -150,9 +153,10 @@ class Config(BaseSettings):
             if len(given) != joints:
                 raise ValueError(f"{name} has {len(given)} entries, axes has {joints}")
         self.controller.require_joints(joints)
-        nodes = [axis.node_id for axis in self.axes]
+        nodes = [(axis.family, axis.node) for axis in self.axes]
         if len(set(nodes)) != joints:
-            raise ValueError(f"axes: node ids {nodes} are not all different")
+            shown = ", ".join(f"{family} {node}" for family, node in nodes)
+            raise ValueError(f"axes: node ids ({shown}) are not all different")
         if self.loop.feedback_timeout_s >= self.loop.period_s:
             raise ValueError("loop.feedback_timeout_s must be shorter than loop.period_s")
         return self
@@ -185,15 +189,7 @@ def preset_defaults(name: str) -> dict[str, Any]:
         "following_error_rad": [0.8] * n,
         "damping_Nms_rad": [1.0] * n,
     }
-    axes = [
-        {
-            "family": "cia402",
-            "node_id": j,
-            "rated_torque_Nm": round(tau / 3.0, 3),
-            "torque_max_Nm": tau,
-        }
-        for j, tau in enumerate(tau_max, start=1)
-    ]
+    axes = [Cia402Settings.defaults(j, tau) for j, tau in enumerate(tau_max, start=1)]
     return {
         "arm": {"preset": name},
         "axes": axes,
@@ -201,6 +197,20 @@ def preset_defaults(name: str) -> dict[str, Any]:
         "plant": plant.model_dump(),
         "servos": [servo.model_dump() for servo in servos],
     }
+
+
+def _axes_of_families(axes: list[dict[str, Any]], given: object) -> list[dict[str, Any]]:
+    """Return the preset's axes, those given another family with that family's defaults."""
+    if not isinstance(given, Mapping):
+        return axes
+    chosen = list(axes)
+    for place, table in given.items():
+        family = table.get("family") if isinstance(table, Mapping) else None
+        if family in SETTINGS and str(place).isdigit() and 1 <= int(place) <= len(axes):
+            joint = int(place)
+            tau_max_Nm = axes[joint - 1]["torque_max_Nm"]
+            chosen[joint - 1] = SETTINGS[family].defaults(joint, tau_max_Nm)
+    return chosen
 
 
 def _nominal_model(plant: PlantSettings) -> dict[str, Any]:

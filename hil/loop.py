@@ -15,7 +15,7 @@ from drivers.arm_bus import ArmBus
 from drivers.axis import AxisInfo
 from drivers.bus import open_bus
 from drivers.errors import BusError, DriverError
-from drivers.registry import make_axes
+from drivers.registry import heartbeat_cycles, make_axes
 from hil.config import Config
 from hil.control import Control
 from hil.errors import HilError
@@ -220,9 +220,9 @@ def open_arm(config: Config) -> tuple[ArmBus, list[AxisInfo]]:
     bus = ArmBus(
         open_bus(config.bus.address), make_axes(config.axes, period_s=period_s), now_ns=now_ns
     )
-    heartbeat_s = min(axis.heartbeat_ms for axis in config.axes) * 1e-3
     try:
-        return bus, bus.configure(heartbeat_cycles=max(1, round(heartbeat_s / period_s)))
+        cycles = heartbeat_cycles(config.axes, period_s=period_s)
+        return bus, bus.configure(heartbeat_cycles=cycles)
     except BaseException:
         bus.close()
         raise

@@ -11,7 +11,7 @@ from controller.machine import State, Trigger
 from controller.reference import Reference
 from drivers.arm_bus import ArmBus
 from drivers.buses.loopback import LoopbackBus
-from drivers.registry import make_axes
+from drivers.registry import heartbeat_cycles, make_axes
 from hil.config import Config
 from hil.control import ArmLink, Control
 from hil.emulation import build_emulator
@@ -95,8 +95,8 @@ class Simulation:
         if self._sink is not None:
             bus.log_frames(self._log_frame)
         emulator.power_on()
-        heartbeat_s = min(axis.heartbeat_ms for axis in config.axes) * 1e-3
-        bus.configure(heartbeat_cycles=round(heartbeat_s / config.loop.period_s))
+        period_s = config.loop.period_s
+        bus.configure(heartbeat_cycles=heartbeat_cycles(config.axes, period_s=period_s))
         return emulator, bus
 
     def _build_ideal(self) -> tuple[IdealArm, IdealArm]:

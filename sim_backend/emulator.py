@@ -7,7 +7,7 @@ advances everything by one period; otherwise the caller passes the wall's time o
 
 from collections.abc import Sequence
 
-from drivers.frame import ERR_FLAG, FRAME_SIZE, RTR_FLAG, unpack_frame
+from drivers.frame import ERR_FLAG, FRAME_SIZE, LOCKSTEP_ID, RTR_FLAG, unpack_frame
 from sim_backend.arm import Arm
 from sim_backend.chain import CURRENT_LOOP_PERIOD_NS
 from sim_backend.errors import SimError
@@ -44,6 +44,7 @@ class Emulator:
 
     __slots__ = (
         "_arm",
+        "_cyclic_nodes",
         "_first_half_Nm",
         "_is_waiting",
         "_nodes",
@@ -71,6 +72,9 @@ class Emulator:
                 f" got {len(servos)} and {len(nodes)}"
             )
         self._arm, self._servos, self._nodes = arm, tuple(servos), tuple(nodes)
+        self._cyclic_nodes = [
+            n for n in nodes if type(n).begin_period is not AmplifierNode.begin_period
+        ]
         self.is_lockstep = is_lockstep
         self._is_waiting = arm.settings.is_held_until_enabled
         if self._is_waiting:
@@ -114,7 +118,7 @@ class Emulator:
         can_id, data = unpack_frame(frame)
         if can_id & _NOT_DATA:
             return
-        if can_id != SYNC_ID:
+        if can_id != SYNC_ID and can_id != LOCKSTEP_ID:  # noqa: PLR1714 - every frame
             for node in self._nodes:
                 node.receive(can_id, data)
             return
@@ -122,6 +126,7 @@ class Emulator:
         for node in self._nodes:
             node.receive(can_id, data)
         if self.is_lockstep:
+            self._begin_period()
             self.advance_period()
 
     def advance_period(self) -> None:
@@ -168,6 +173,12 @@ class Emulator:
         self.tau_applied_Nm = [0.5 * (a + b) for a, b in zip(first, tau_Nm, strict=True)]
         for node in self._nodes:
             node.tick(TICK_S)
+        if not self.is_lockstep:
+            self._begin_period()
+
+    def _begin_period(self) -> None:
+        for node in self._cyclic_nodes:
+            node.begin_period()
 
     def _sense_joints(self) -> None:
         arm = self._arm

@@ -32,3 +32,10 @@ class AmplifierNode(ABC):
     @abstractmethod
     def tick(self, dt_s: float) -> None:
         """Advance the node's timers (heartbeat, watchdogs) by `dt_s` of emulated time."""
+
+    def begin_period(self) -> None:  # noqa: B027 - most families answer SYNC instead
+        """Send the cyclic messages that are due now.
+
+        Called once per period of 1 ms: in lockstep when the master's SYNC or lockstep frame
+        arrives, before time advances; by the clock after `tick`.
+        """

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from time import monotonic_ns
 
-from drivers.frame import unpack_header
+from drivers.frame import LOCKSTEP_ID, unpack_header
 from sim_backend.emulator import SYNC_ID, Emulator
 from sim_backend.hub import Wire
 from sim_backend.settings import EmulatorSettings
@@ -12,6 +12,7 @@ TICK_NS = 500_000
 """Wall time advances the plant in steps of its current loops' period."""
 CATCH_UP_NS = 1_000_000_000
 """A process that was stopped for longer than this does not make up for more."""
+_TICKS = ((SYNC_ID, 0), (LOCKSTEP_ID, 0))
 
 
 class EmulatorServer:
@@ -57,7 +58,7 @@ class EmulatorServer:
             self._advance_by_clock()
         for frame in frames:
             self.frames += 1
-            if unpack_header(frame) == (SYNC_ID, 0):
+            if unpack_header(frame) in _TICKS:
                 self._take_sync()
             self._emulator.receive(frame)
         if self._emulator.is_lockstep:  # also if others than the master talk on

@@ -1,6 +1,6 @@
 """Settings of a CiA 402 amplifier. Scales are configuration and are checked against the drive."""
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -20,3 +20,23 @@ class Cia402Settings(AxisSettings):
         20, ge=2, le=1000, description="the drive removes torque after this long without a command"
     )
     sdo_timeout_s: float = Field(0.5, gt=0)
+
+    @classmethod
+    def defaults(cls, joint: int, tau_max_Nm: float) -> dict[str, Any]:
+        """See `AxisSettings.defaults`: rated for a third of the motor's largest torque."""
+        return {
+            "family": "cia402",
+            "node_id": joint,
+            "rated_torque_Nm": round(tau_max_Nm / 3.0, 3),
+            "torque_max_Nm": tau_max_Nm,
+        }
+
+    @property
+    def node(self) -> int:
+        """CANopen node id."""
+        return self.node_id
+
+    @property
+    def master_heartbeat_ms(self) -> int:
+        """The master's heartbeat is as frequent as the drive's."""
+        return self.heartbeat_ms

@@ -38,10 +38,15 @@ def test_make_axes__period__told_to_the_drive(period_s):
     assert rig.nodes[0].cycle_time_s == pytest.approx(period_s)
 
 
-@pytest.mark.parametrize("family", list(registry._FAMILIES))
-def test_families__every_line__leads_to_an_axis(family):
-    module, _, name = registry._FAMILIES[family].partition(":")
+@pytest.mark.parametrize("family", list(registry.SETTINGS))
+def test_families__every_line__leads_to_an_axis_and_its_settings(family):
+    module, _, name = registry._MASTERS[family].partition(":")
     assert issubclass(getattr(import_module(module), name), Axis)
+    settings = registry.SETTINGS[family].model_validate(registry.SETTINGS[family].defaults(2, 15.0))
+    assert settings.node == 2
+    assert settings.family == family
+    (axis,) = make_axes([settings], period_s=T)
+    assert axis.label.startswith("joint 1 (")
 
 
 def test_settings__by_family__the_familys_own():
