@@ -131,7 +131,7 @@ def test_preset__each__is_a_whole_configuration(name):
         ('axes = [{family = "cia402", node_id = 1}]\n', "axes.0"),
         ('axes = [{family = "telepathy"}]\n', "axes.0"),
         ("axes = []\n", "axes"),
-        ("[axes.2]\nnode_id = 1\n", "node ids [1, 1] are not all different"),
+        ("[axes.2]\nnode_id = 1\n", "node ids (cia402 1, cia402 1) are not all different"),
         ("servos = []\n", "servos has 0 entries, axes has 2"),
         ("[plant]\nq0_rad = [0.0]\n", "plant.q0_rad has 1 entries, axes has 2"),
     ],

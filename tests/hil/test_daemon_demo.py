@@ -77,8 +77,10 @@ def test_demo__recording__opens_with_the_mcap_reader_and_is_plain_protobuf(demo,
 
 def test_demo__recording__shows_the_whole_run(recording):
     samples = recording.samples
+    changes = [e.detail["to"] for e in recording.events if e.kind == "state"]
+    assert changes == ["IDLE", "READY", "ACTIVE", "HOLD", "STOPPING", "IDLE"]
     visited = list(dict.fromkeys(State(int(s)).name for s in samples["state"]))
-    assert visited == ["IDLE", "READY", "ACTIVE", "HOLD", "STOPPING"]
+    assert visited[:4] == ["IDLE", "READY", "ACTIVE", "HOLD"]  # at rest, STOPPING takes no cycle
     assert samples["state"][-1] == State.IDLE
     active = samples[samples["state"] == State.ACTIVE]
     assert 20.0 <= active["t_ref_s"][-1] < 20.5  # the braking at its end included
