@@ -47,16 +47,18 @@ class TorqueLimiter:
             CommandError: If a torque is NaN or infinite. Nothing has been sent.
         """
         sent = []
-        for (tau_max, slew), cmd, before in zip(
+        for (tau_max, slew), wanted, before in zip(
             self._limits, tau_cmd_Nm, self.tau_sent_Nm, strict=True
         ):
-            wanted = limit_torque(cmd, tau_max_Nm=tau_max)
+            if not -tau_max <= wanted <= tau_max:
+                wanted = limit_torque(wanted, tau_max_Nm=tau_max)  # noqa: PLW2901 - rarely taken
             reach = slew * dt_s
             if wanted > before + reach:
-                wanted = before + reach
+                sent.append(before + reach)
             elif wanted < before - reach:
-                wanted = before - reach
-            sent.append(wanted)
+                sent.append(before - reach)
+            else:
+                sent.append(wanted)
         self.tau_sent_Nm = sent
         return sent
 

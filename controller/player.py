@@ -1,6 +1,8 @@
 """Plays a compiled reference: the loop only indexes; a stop slows down along the path."""
 
+from array import array
 from collections.abc import Sequence
+from struct import Struct
 from typing import NamedTuple
 
 SHORTEST_STOP_PERIODS = 10
@@ -16,9 +18,9 @@ _STOP_SHAPE = tuple(
 class Setpoint(NamedTuple):
     """Reference of one cycle, per joint."""
 
-    q_rad: list[float]
-    dq_rad_s: list[float]
-    ddq_rad_s2: list[float]
+    q_rad: Sequence[float]
+    dq_rad_s: Sequence[float]
+    ddq_rad_s2: Sequence[float]
 
 
 class ReferencePlayer:
@@ -34,7 +36,8 @@ class ReferencePlayer:
     def __init__(self, joints: int, period_s: float) -> None:
         self._joints = joints
         self._period_s = period_s
-        self._rows: Sequence[float] | None = None
+        self._rows: memoryview | None = None
+        self._read_row = Struct(f"={3 * joints}d").unpack_from
         self._last = 0
         self._phase = 0.0
         self._speed = 1.0
@@ -69,13 +72,14 @@ class ReferencePlayer:
         """Play a motion from its first row, which the next step returns.
 
         Args:
-            rows: Flat doubles, `samples` rows of q, dq, ddq for all joints; kept, not copied.
+            rows: Flat doubles, `samples` rows of q, dq, ddq for all joints; a view of doubles is
+                kept, anything else is copied.
             samples: Number of rows, at least 1.
             ahead: Periods from now to the first row, at least 1. The next step is at least as
                 long; if it is longer, it returns the row that is due by then.
         """
         self._end()
-        self._rows = rows
+        self._rows = rows if isinstance(rows, memoryview) else memoryview(array("d", rows))
         self._last = samples - 1
         self._phase = -float(ahead)
 
@@ -148,8 +152,7 @@ class ReferencePlayer:
     def _row(self, index: int) -> Setpoint:
         assert self._rows is not None  # noqa: S101 - only called while a motion is played
         n = self._joints
-        start = index * 3 * n
-        row = list(self._rows[start : start + 3 * n])
+        row = self._read_row(self._rows, 24 * n * index)
         return Setpoint(row[:n], row[n : 2 * n], row[2 * n :])
 
     def _end(self) -> None:

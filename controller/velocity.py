@@ -33,6 +33,7 @@ class FilteredDifference(VelocityEstimator):
 
     def __init__(self, joints: int, cutoff_Hz: float) -> None:
         self._rate_per_s = 2.0 * math.pi * cutoff_Hz
+        self._dt_s = self._share = 0.0
         self._q_rad = [0.0] * joints
         self.dq_rad_s = [0.0] * joints
 
@@ -43,7 +44,9 @@ class FilteredDifference(VelocityEstimator):
 
     def step(self, q_rad: Sequence[float], dt_s: float) -> list[float]:
         """Take a measurement; the filter is discretised exactly for a held input."""
-        share = 1.0 - math.exp(-self._rate_per_s * dt_s)
+        if dt_s != self._dt_s:
+            self._dt_s, self._share = dt_s, 1.0 - math.exp(-self._rate_per_s * dt_s)
+        share = self._share
         self.dq_rad_s = [
             dq + share * ((q - before) / dt_s - dq)
             for q, before, dq in zip(q_rad, self._q_rad, self.dq_rad_s, strict=True)

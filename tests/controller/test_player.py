@@ -69,9 +69,9 @@ def collected(player, periods=1):
 def same(setpoint, reference, row):
     state = reference.state(row)
     return (
-        setpoint.q_rad == state.q_rad.tolist()
-        and setpoint.dq_rad_s == state.dq_rad_s.tolist()
-        and setpoint.ddq_rad_s2 == state.ddq_rad_s2.tolist()
+        list(setpoint.q_rad) == state.q_rad.tolist()
+        and list(setpoint.dq_rad_s) == state.dq_rad_s.tolist()
+        and list(setpoint.ddq_rad_s2) == state.ddq_rad_s2.tolist()
     )
 
 
