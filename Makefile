@@ -4,9 +4,12 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+LAB_KERNEL ?= auto# auto, host or uml: see docs/lab.md
+LAB = $(PYTHON) deploy/lab/lab.py --kernel $(LAB_KERNEL)
+LAB_TESTS = $(BIN)/python -m pytest -m kernel_can --no-skips tests/drivers tests/lab
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench proto clean
+.PHONY: help demo test lab lint bench proto clean
 
 help: ## show the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -22,8 +25,14 @@ demo: $(STAMP) ## an emulated arm tracks a trajectory over real frames; verdict 
 	$(BIN)/hil demo
 
 # A host that stalls for a second can fail a test of real processes: what failed runs once more, alone.
+# The tests that need a kernel with CAN run on one of their own: in the lab.
 test: $(STAMP) lint ## everything CI runs
-	$(BIN)/python -m pytest || $(BIN)/python -m pytest --last-failed --last-failed-no-failures none
+	$(BIN)/python -m pytest -m "not kernel_can" || \
+	  $(BIN)/python -m pytest -m "not kernel_can" --last-failed --last-failed-no-failures none
+	@$(LAB) --optional -- $(LAB_TESTS)
+
+lab: $(STAMP) ## the tests of SocketCAN on a real kernel with CAN
+	@$(LAB) -- $(LAB_TESTS)
 
 lint: $(STAMP) ## format, lint, types, import rules
 	$(BIN)/ruff format --check

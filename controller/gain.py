@@ -1,6 +1,7 @@
 """The gain of tau = -Kd S: constant, or tuned by the paper's neuro-fuzzy network (section 4)."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 from controller.membership import BIG, MEDIUM, MEMBERSHIPS, SMALL
 from controller.membership import sigmoid as memberships
@@ -70,7 +71,8 @@ class SelfTuningGain(Gain):
     `literal`: beta -= rate S alpha mu, as printed (not mirror-symmetric);
     `absolute`: beta -= rate |S| alpha mu; `true_sign`: beta += rate |S| alpha mu, with the sign
     that d(q_err)/dKd really has; `off`. Every beta is boxed to [Kd_min, Kd_max] and the sum is
-    clipped to it. When the bounds move, each beta keeps its place between them.
+    clipped to it. When the bounds move, each beta keeps its place between them; bounds configured
+    without room between them give it the place that it has among the configured ones.
     """
 
     __slots__ = ("_is_absolute", "_memberships", "_mu", "_place", "_rate_per_s", "beta")
@@ -84,7 +86,7 @@ class SelfTuningGain(Gain):
         self._memberships = MEMBERSHIPS[settings.membership]
         self._mu = (0.0, 0.0, 0.0)
         self.beta = [self._box(beta) for beta in settings.beta]
-        self._place = [0.0, 0.0, 0.0]
+        self._place = _places(settings.beta)
 
     def step(self, S: float, dt_s: float) -> float:
         """Return Kd_hat for this cycle; see the class."""
@@ -120,3 +122,10 @@ class SelfTuningGain(Gain):
         if beta < self.Kd_min:
             return self.Kd_min
         return beta if beta < self.Kd_max else self.Kd_max
+
+
+def _places(beta: Sequence[float]) -> list[float]:
+    """Return the place of each consequence between the smallest, 0, and the largest, 1."""
+    low = min(beta)
+    span = max(beta) - low
+    return [(each - low) / span if span > 0.0 else 0.0 for each in beta]

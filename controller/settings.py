@@ -25,6 +25,19 @@ def _require_lengths(settings: BaseModel, names: Iterable[str], joints: int) -> 
             raise ValueError(f"{name} has {given} entries, the arm has {joints} joints")
 
 
+def _require_above_zero(settings: BaseModel, names: Iterable[str]) -> None:
+    for name in names:
+        for j, value in enumerate(getattr(settings, name), start=1):
+            if not value > 0.0:
+                raise ValueError(f"joint {j}: {name} {value:g} must be above 0")
+
+
+def _require_not_negative(settings: BaseModel, name: str) -> None:
+    for j, value in enumerate(getattr(settings, name), start=1):
+        if value < 0.0:
+            raise ValueError(f"joint {j}: {name} {value:g} must not be below 0")
+
+
 class VelocitySettings(_Settings):
     """How joint velocity is estimated from the encoder."""
 
@@ -41,6 +54,11 @@ class VelocitySettings(_Settings):
         gt=0,
         description="Levant: position error beyond which lock is lost and the loop trips",
     )
+
+    @model_validator(mode="after")
+    def _check_signs(self) -> Self:
+        _require_above_zero(self, ("C_rad_s2",))
+        return self
 
 
 class LawSettings(_Settings):
@@ -89,10 +107,14 @@ class LawSettings(_Settings):
     )
 
     @model_validator(mode="after")
+    def _check_signs(self) -> Self:
+        clip = () if self.tau_clip_Nm is None else ("tau_clip_Nm",)
+        _require_above_zero(self, ("alpha", "lambda_", "Kd", *clip))
+        _require_not_negative(self, "Ki")
+        return self
+
+    @model_validator(mode="after")
     def _check_bounds(self) -> Self:
-        for j, clip in enumerate(self.tau_clip_Nm or (), start=1):
-            if not clip > 0.0:
-                raise ValueError(f"joint {j}: tau_clip_Nm {clip:g} must be above 0")
         for j, (low, high) in enumerate(zip(self.Kd_min, self.Kd_max, strict=False), start=1):
             if not self.Kd_floor <= low <= high <= self.Kd_ceiling:
                 raise ValueError(
@@ -175,14 +197,12 @@ class LimitSettings(_Settings):
 
     @model_validator(mode="after")
     def _check_signs(self) -> Self:
-        for name in ("dq_max_rad_s", "dq_trip_rad_s", "ddq_max_rad_s2", "dddq_max_rad_s3",
-                     "tau_max_Nm", "tau_slew_Nm_s", "following_error_rad"):  # fmt: skip
-            for j, value in enumerate(getattr(self, name), start=1):
-                if not value > 0.0:
-                    raise ValueError(f"joint {j}: {name} {value:g} must be above 0")
-        for j, damping in enumerate(self.damping_Nms_rad, start=1):
-            if damping < 0.0:
-                raise ValueError(f"joint {j}: damping_Nms_rad {damping:g} must not be below 0")
+        _require_above_zero(
+            self,
+            ("dq_max_rad_s", "dq_trip_rad_s", "ddq_max_rad_s2", "dddq_max_rad_s3",
+             "tau_max_Nm", "tau_slew_Nm_s", "following_error_rad"),
+        )  # fmt: skip
+        _require_not_negative(self, "damping_Nms_rad")
         for j, (low, high) in enumerate(zip(self.q_min_rad, self.q_max_rad, strict=False), start=1):
             if not low < high:
                 raise ValueError(f"joint {j}: q_min_rad {low:g} must be below q_max_rad {high:g}")

@@ -5,16 +5,27 @@ from collections.abc import Callable, Sequence
 from drivers.axis import Axis, AxisInfo, AxisStatus, FrameHandler
 from drivers.bus import Bus
 from drivers.errors import AmplifierError, BusError
-from drivers.frame import EFF_MASK, ERR_FLAG, LOCKSTEP_ID, pack_frame, unpack_frame, unpack_header
+from drivers.frame import (
+    EFF_MASK,
+    ERR_FLAG,
+    LOCKSTEP_ID,
+    pack_fd_frame,
+    pack_frame,
+    unpack_frame,
+    unpack_header,
+)
 
 SYNC_ID = 0x080
 HEARTBEAT_ID = 0x700
 RECEIVED, SENT = 0, 1
 OVERDUE_FRAMES = 100
-"""Queued frames still looked at during start-up when the time to wait for one is up."""
+"""Queued frames still looked at when the time to wait for one is up."""
+FLOOD_FRAMES = 4096
+"""So many leftovers at the start of a cycle are more than a second's stall leaves behind: the bus
+is flooded, and what is still queued is too old to be used."""
 
 FrameLog = Callable[[int, bytes], None]
-"""Called with (RECEIVED or SENT, 16-byte record) for every frame, in the order seen."""
+"""Called with (RECEIVED or SENT, record) for every frame, in the order seen."""
 
 
 class ArmBus:
@@ -42,7 +53,9 @@ class ArmBus:
         self._bus = bus
         self._now_ns = now_ns
         self._log: FrameLog | None = None
+        self._is_flooded = False
         self._handlers: dict[int, FrameHandler] = {}
+        self._shared_ids: frozenset[int] = frozenset()
         self._sync = pack_frame(SYNC_ID) if any(a.uses_sync for a in axes) else None
         self._heartbeat = pack_frame(HEARTBEAT_ID + master_id, b"\x05")
         self._heartbeat_every = 0
@@ -65,6 +78,7 @@ class ArmBus:
             BusError: If the bus is gone.
         """
         self._heartbeat_every = heartbeat_cycles
+        self._bus.accept(None)
         port = _Port(self._bus, self._now_ns, self._log)
         if port.wait(SYNC_ID, 0.02) is not None:
             raise AmplifierError(
@@ -78,16 +92,23 @@ class ArmBus:
         for axis in self.axes:
             axis.start(port)
             self._add_handlers(axis)
+        self._bus.accept({SYNC_ID, LOCKSTEP_ID, *self._handlers})  # another master's SYNC too
         return infos
 
     def _add_handlers(self, axis: Axis) -> None:
+        shared = axis.shared_ids()
         for can_id, handler in axis.handlers().items():
-            if can_id in self._handlers:
+            other = self._handlers.get(can_id)
+            if other is None:
+                self._handlers[can_id] = handler
+            elif can_id in shared and can_id in self._shared_ids:
+                self._handlers[can_id] = _either(other, handler)
+            else:
                 raise AmplifierError(
                     f"{axis.label}: identifier 0x{can_id & EFF_MASK:X} belongs to another axis too;"
                     " give one of them another node id"
                 )
-            self._handlers[can_id] = handler
+        self._shared_ids |= shared
 
     def request_feedback(self) -> None:
         """Begin a cycle: discard what came too late for the last one, then ask, SYNC last."""
@@ -109,13 +130,23 @@ class ArmBus:
         Raises:
             BusError: If the bus is gone.
         """
+        missing = 0
         for axis in self.axes:
             axis.age_cycles += 1
-        missing = len(self.axes)
+            if axis.age_cycles > 0:
+                missing += 1
+        if self._is_flooded:
+            return False
+        overdue = 0
         recv, handlers, log = self._bus.recv, self._handlers, self._log
         while missing:
             remaining_s = (deadline_ns - self._now_ns()) * 1e-9
-            frame = recv(remaining_s if remaining_s > 0.0 else 0.0)
+            if remaining_s <= 0.0:
+                overdue += 1
+                remaining_s = 0.0
+                if overdue > OVERDUE_FRAMES:
+                    break
+            frame = recv(remaining_s)
             if frame is None:
                 break
             if log is not None:
@@ -187,7 +218,9 @@ class ArmBus:
 
     def _drain(self) -> None:
         """Take frames left over from the last cycle; feedback among them is late and not used."""
-        while (frame := self._bus.recv(0.0)) is not None:
+        left = FLOOD_FRAMES
+        while left and (frame := self._bus.recv(0.0)) is not None:
+            left -= 1
             if self._log is not None:
                 self._log(RECEIVED, frame)
             handler = self._handlers.get(unpack_header(frame)[0])
@@ -195,12 +228,18 @@ class ArmBus:
                 self._count_foreign(frame)
             elif handler(frame):
                 self.late_frames += 1
+        self._is_flooded = not left
 
     def _count_foreign(self, frame: bytes) -> None:
         if unpack_header(frame)[0] & ERR_FLAG:
             self.error_frames += 1
         else:
             self.unknown_frames += 1
+
+
+def _either(first: FrameHandler, second: FrameHandler) -> FrameHandler:
+    """Return the handler of an identifier that two axes are answered on."""
+    return lambda frame: first(frame) or second(frame)
 
 
 class _Port:
@@ -211,8 +250,13 @@ class _Port:
         self._now_ns = now_ns
         self._log = log
 
-    def send(self, can_id: int, data: bytes) -> None:
-        frame = pack_frame(can_id, data)
+    def send(self, can_id: int, data: bytes, *, is_fd: bool = False) -> None:
+        if is_fd and not self._bus.carries_fd:
+            raise BusError(
+                "this bus carries no CAN FD frames, which an amplifier here needs; use a bus that "
+                "does (on Linux: `ip link set can0 ... fd on`)"
+            )
+        frame = pack_fd_frame(can_id, data) if is_fd else pack_frame(can_id, data)
         if not self._bus.send(frame):
             raise BusError("the bus takes no frames (send queue full); is any other node on it?")
         if self._log is not None:

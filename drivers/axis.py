@@ -34,11 +34,16 @@ class AxisInfo:
 class Port(Protocol):
     """The bus as an axis sees it during start-up, when waiting is allowed."""
 
-    def send(self, can_id: int, data: bytes) -> None:
+    def send(self, can_id: int, data: bytes, *, is_fd: bool = False) -> None:
         """Put a frame on the bus.
 
+        Args:
+            can_id: Identifier with flags (`drivers.frame`).
+            data: 0 to 8 bytes; of CAN FD as many as `drivers.frame.FD_LENGTHS` allows.
+            is_fd: A CAN FD frame, its data at the second bit rate.
+
         Raises:
-            BusError: If the bus is gone or its queue stays full.
+            BusError: If the bus is gone, its queue stays full, or it carries no CAN FD.
         """
 
     def wait(self, can_id: int, timeout_s: float) -> bytes | None:
@@ -46,7 +51,7 @@ class Port(Protocol):
 
 
 FrameHandler = Callable[[bytes], bool]
-"""Takes one 16-byte record; True if it was this cycle's feedback of the axis. Never raises."""
+"""Takes one frame record; True if it was this cycle's feedback of the axis. Never raises."""
 
 
 class Axis(ABC):
@@ -57,7 +62,8 @@ class Axis(ABC):
         q_rad: Joint angle of the last fresh feedback.
         dq_rad_s: Joint rate the amplifier reported with it; None if the family reports none.
         tau_meas_Nm: Joint torque the amplifier reported with it.
-        age_cycles: Cycles since that feedback; 0 = fresh.
+        age_cycles: Cycles since that feedback; 0 = fresh. Between two cycles, -1 = it came since the
+            last one, from an amplifier that sends by its own clock, and counts for the next.
         status: What the amplifier says of itself.
         note: One line about the last fault or emergency message, empty if there was none.
         uses_sync: The family needs a CANopen SYNC at the start of each cycle.
@@ -90,6 +96,10 @@ class Axis(ABC):
     @abstractmethod
     def handlers(self) -> dict[int, FrameHandler]:
         """Identifiers of the frames this axis takes in operation, each with its handler."""
+
+    def shared_ids(self) -> frozenset[int]:
+        """Identifiers on which other axes may be answered too: its handler knows its own frames."""
+        return frozenset()
 
     def request(self) -> bytes | None:
         """Return the frame that asks for feedback at the start of a cycle, None if none is needed.

@@ -1,12 +1,13 @@
 """The bus interface and its registry: one address line selects a back-end.
 
-Addresses: `unix:PATH`, `socketcan:IFACE` (short `vcan0`, `can0`),
+Addresses: `unix:PATH`, `socketcan:IFACE` (short `vcan0`, `can0`), `slcan:DEVICE[@BITRATE]`,
 `python-can:INTERFACE:CHANNEL[@BITRATE]`.
 Back-ends are imported when first used, so that a missing optional library only matters to
 those who ask for it.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Collection
 from dataclasses import dataclass
 from importlib import import_module
 from types import TracebackType
@@ -29,11 +30,17 @@ class BusStats:
     receive_overflows: int = 0
     """Frames the kernel dropped because nobody read them in time, where the back-end can tell."""
     malformed_records: int = 0
-    """Records that are no classic CAN frame (wrong size, CAN FD): dropped, never raised."""
+    """Records that are no CAN frame, or none this bus carries: dropped, never raised."""
 
 
 class Bus(ABC):
-    """One participant on one CAN bus. Frames are 16-byte records (`drivers.frame`)."""
+    """One participant on one CAN bus. Frames are records (`drivers.frame`).
+
+    Attributes:
+        carries_fd: CAN FD frames can be sent and received; elsewhere one that is sent is lost.
+    """
+
+    carries_fd = True
 
     def __init__(self) -> None:
         self.stats = BusStats()
@@ -57,7 +64,20 @@ class Bus(ABC):
             timeout_s: 0 polls. Resolution is microseconds, not milliseconds.
 
         Returns:
-            The 16-byte record, or None when the time is up. Error reports carry `ERR_FLAG`.
+            The record, or None when the time is up. Error reports carry `ERR_FLAG`.
+
+        Raises:
+            BusError: If the bus is gone.
+        """
+
+    def accept(self, can_ids: Collection[int] | None) -> None:  # noqa: B027 - optional
+        """Have `recv` return only frames with these identifiers, and error reports.
+
+        For back-ends where this spares the process the others (filters of the kernel); elsewhere
+        it does nothing, and all frames keep coming.
+
+        Args:
+            can_ids: Identifiers with flags; None = all.
 
         Raises:
             BusError: If the bus is gone.
@@ -91,6 +111,7 @@ class Bus(ABC):
 _BACKENDS = {  # scheme -> "module:class"; the class takes the rest of the address
     "unix": "drivers.buses.unix:UnixBus",
     "socketcan": "drivers.buses.socketcan:SocketCanBus",
+    "slcan": "drivers.buses.slcan:SlcanBus",
     "python-can": "drivers.buses.python_can:PythonCanBus",
 }
 
@@ -105,7 +126,10 @@ def split_address(address: str) -> tuple[str, str]:
     if not colon:
         scheme, rest = "socketcan", address
     if scheme not in _BACKENDS or not rest:
-        forms = "unix:PATH, socketcan:IFACE (or just IFACE), python-can:INTERFACE:CHANNEL[@BITRATE]"
+        forms = (
+            "unix:PATH, socketcan:IFACE (or just IFACE), slcan:DEVICE[@BITRATE], "
+            "python-can:INTERFACE:CHANNEL[@BITRATE]"
+        )
         raise BusAddressError(f"bus address {address!r} is not one of: {forms}")
     return scheme, rest
 

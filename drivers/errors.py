@@ -9,6 +9,10 @@ class BusError(DriverError):
     """A bus could not be opened, or failed while in use."""
 
 
+class BusDownError(BusError):
+    """The bus is not there now but may come back: the same `Bus` then works again."""
+
+
 class BusAddressError(BusError):
     """A bus address could not be understood; the message names the forms that can."""
 

@@ -2,22 +2,32 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from drivers.axis import Axis
 from drivers.cia402.settings import Cia402Settings
+from drivers.mit.settings import MitSettings
+from drivers.odrive.settings import OdriveSettings
 from drivers.settings import AxisSettings
 
-AnyAxisSettings = Cia402Settings
+AnyAxisSettings = Annotated[
+    Cia402Settings | MitSettings | OdriveSettings, Field(discriminator="family")
+]
 """Settings of any family, told apart by `family`."""
 
 SETTINGS: dict[str, type[AxisSettings]] = {
     "cia402": Cia402Settings,
+    "mit": MitSettings,
+    "odrive": OdriveSettings,
 }
 """Family -> its settings."""
 
 _MASTERS = {  # family -> "module:class" of its master side
     "cia402": "drivers.cia402.master:Cia402Axis",
+    "mit": "drivers.mit.master:MitAxis",
+    "odrive": "drivers.odrive.master:OdriveAxis",
 }
 
 
@@ -39,3 +49,18 @@ def heartbeat_cycles(settings: Sequence[AxisSettings], *, period_s: float) -> in
     """Return after how many cycles the master's heartbeat is due, 0 if no axis listens for one."""
     intervals_ms = [axis.master_heartbeat_ms for axis in settings if axis.master_heartbeat_ms]
     return max(1, round(min(intervals_ms) * 1e-3 / period_s)) if intervals_ms else 0
+
+
+def find_clash(settings: Sequence[Any]) -> str:
+    """Say in one line which two axes use one identifier for two things; empty if none do."""
+    uses: dict[int, tuple[str, str]] = {}
+    for joint, axis in enumerate(settings, start=1):
+        who = f"joint {joint} ({axis.family} node {axis.node})"
+        for can_id, use in axis.identifiers().items():
+            other, other_use = uses.setdefault(can_id, (who, use))
+            if use != other_use:
+                return (
+                    f"identifier 0x{can_id:03X} is {use} of {who} and {other_use} of {other}; "
+                    "give one of them another node_id"
+                )
+    return ""

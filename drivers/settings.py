@@ -1,9 +1,29 @@
 """Settings that every amplifier family has."""
 
 from abc import ABC, abstractmethod
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
+
+ACYCLIC = 100
+"""`CycleFrame.every` of what comes now and then: at most one in so many cycles."""
+
+
+class CycleFrame(NamedTuple):
+    """A kind of frame that an amplifier in operation, or its master, puts on the bus."""
+
+    name: str
+    """In the family's own words."""
+    length: int
+    """Data bytes, at most. CAN FD: a length that exists (8, 12, 16, 20, 24, 32, 48, 64)."""
+    is_extended: bool = False
+    """29-bit identifier."""
+    is_fd: bool = False
+    """CAN FD, data at the bus's second bit rate."""
+    every: int = 1
+    """At most one in so many cycles; 1 = in every cycle."""
+    is_shared: bool = False
+    """Once per bus: axes that name the same frame share it (SYNC, the master's heartbeat)."""
 
 
 class AxisSettings(BaseModel, ABC):
@@ -35,3 +55,18 @@ class AxisSettings(BaseModel, ABC):
     def master_heartbeat_ms(self) -> int:
         """The longest silence of the master's CANopen heartbeat; 0 = the family knows none."""
         return 0
+
+    def identifiers(self) -> dict[int, str]:
+        """Return the 11-bit identifiers used with this axis, both directions, and what for.
+
+        Axes that name the same use of an identifier share it. Empty: the family does not say.
+        """
+        return {}
+
+    def cycle_frames(self, period_s: float) -> tuple[CycleFrame, ...]:
+        """Return every kind of frame on the bus because of this axis, in both directions.
+
+        Args:
+            period_s: The control period.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not say what it puts on the bus")

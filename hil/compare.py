@@ -5,13 +5,16 @@ gain that is clipped to the self-tuned law's peak torque needs that peak first, 
 in a second round.
 """
 
-import csv
-import io
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import os
+import signal
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field, replace
 from itertools import product
 from multiprocessing import get_context
+from time import process_time
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -22,6 +25,7 @@ from hil.experiment import Memory, play_in_simulation
 from hil.messages import KellyRequest
 from hil.metrics import MetricsError, measure
 from hil.planner import Refusal
+from hil.realtime import die_with_parent
 from hil.simulation import SimulationError
 from sim_backend.perturbation import (
     scaled,
@@ -47,17 +51,33 @@ class CompareError(HilError):
 
 
 LAWS: Final[Mapping[str, Table]] = {
-    REFERENCE: {"name": "self_tuning_pid"},
-    "load memory": {"name": "self_tuning_pid", "tuner": "load_memory"},
-    "self-tuning pd": {"name": "self_tuning_pd"},
-    "pid Kd=1": {"name": "pid", "Kd": [1.0, 1.0]},
-    "pid Kd=4": {"name": "pid", "Kd": [4.0, 4.0]},
-    CLIPPED: {"name": "pid", "Kd": [4.0, 4.0]},
-    "pd Kd=4": {"name": "pd", "Kd": [4.0, 4.0]},
-    "computed torque": {"name": "computed_torque"},
-    "slotine-li": {"name": "slotine_li"},
+    REFERENCE: {"law": {"name": "self_tuning_pid"}},
+    "load memory": {"law": {"name": "self_tuning_pid", "tuner": "load_memory"}},
+    "self-tuning pd": {"law": {"name": "self_tuning_pd"}},
+    "pid Kd=1": {"law": {"name": "pid", "Kd": [1.0, 1.0]}},
+    "pid Kd=4": {"law": {"name": "pid", "Kd": [4.0, 4.0]}},
+    CLIPPED: {"law": {"name": "pid", "Kd": [4.0, 4.0]}},
+    "pd Kd=4": {"law": {"name": "pd", "Kd": [4.0, 4.0]}},
+    "computed torque": {"law": {"name": "computed_torque"}},
+    "slotine-li": {"law": {"name": "slotine_li"}},
 }
-"""Settings of `controller.law` by the name a law has in the tables."""
+"""Settings of `controller` by the name a law has in the tables."""
+
+VARIANTS: Final[Mapping[str, Table]] = {
+    "manifold sine": {"law": {"manifold": "sine"}},
+    "manifold saturation": {"law": {"manifold": "saturation"}},
+    "membership gaussian_normalised": {"law": {"membership": "gaussian_normalised"}},
+    "membership gaussian_clipped": {"law": {"membership": "gaussian_clipped"}},
+    "membership triangular": {"law": {"membership": "triangular"}},
+    "adaptation off": {"law": {"adaptation": "off"}},
+    "adaptation absolute": {"law": {"adaptation": "absolute"}},
+    "adaptation true_sign": {"law": {"adaptation": "true_sign"}},
+    "velocity levant": {"velocity": {"estimator": "levant"}},
+}
+"""What else can be chosen about the reference law, one thing each, by its name in the settings."""
+
+ALL_LAWS: Final[Mapping[str, Table]] = {**LAWS, **VARIANTS}
+"""Everything that can be put side by side."""
 
 SCENARIOS: Final[Mapping[str, tuple[str, float]]] = {
     "bench_h kelly_4": ("bench_h", 0.25),
@@ -124,6 +144,11 @@ QUICK: Final = (
 """Laws, scenarios and perturbations of `--quick`."""
 
 
+def full() -> list["Case"]:
+    """Return the cases of the whole table: every law everywhere, every variant nominally."""
+    return cases(LAWS, SCENARIOS, PERTURBATIONS) + cases(VARIANTS, SCENARIOS, ["nominal"])
+
+
 @dataclass(frozen=True, slots=True)
 class Case:
     """One run; `tau_clip_Nm` bounds the law's torque where it is clipped."""
@@ -136,7 +161,10 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Figures of one run; tuples have one entry per joint, empty if the run `failed`."""
+    """Figures of one run; tuples have one entry per joint, empty if the run `failed`.
+
+    `cpu_s` is the processor time that the run took, the only one that differs from run to run.
+    """
 
     case: Case
     failed: str = ""
@@ -149,9 +177,10 @@ class Row:
     tv_Nm_s: tuple[float, ...] = ()
     Kd_min: tuple[float, ...] = ()
     Kd_max: tuple[float, ...] = ()
+    cpu_s: float = field(default=0.0, compare=False)
 
 
-FIGURES: Final = tuple(name for name in Row.__slots__ if name not in ("case", "failed"))
+FIGURES: Final = tuple(name for name in Row.__slots__ if name not in ("case", "failed", "cpu_s"))
 
 
 def select(names: Sequence[str] | None, known: Mapping[str, Any], what: str) -> list[str]:
@@ -176,29 +205,30 @@ def cases(
 def configure(case: Case) -> Config:
     """Return the configuration of a case."""
     preset, _ = SCENARIOS[case.scenario]
-    law = dict(LAWS[case.law])
+    controller = merge(ALL_LAWS[case.law], {"limits": {"following_error_rad": [3.0, 3.0]}})
     if case.tau_clip_Nm is not None:
-        law["tau_clip_Nm"] = case.tau_clip_Nm
+        controller = merge(controller, {"law": {"tau_clip_Nm": case.tau_clip_Nm}})
     base = {
         "arm": {"preset": preset},
         "plant": {"q0_rad": START_ERROR_RAD},
-        "controller": {"law": law, "limits": {"following_error_rad": [3.0, 3.0]}},
+        "controller": controller,
     }
     return load_config(None, merge(base, PERTURBATIONS[case.perturbation](load_config(None, base))))
 
 
 def run_case(case: Case) -> Row:
     """Simulate one case and take its figures; a run that trips is a row that says so."""
+    began_s = process_time()
     _, rate = SCENARIOS[case.scenario]
     request = KellyRequest(duration_s=DURATION_S, rate=rate, approach="none")
     config = configure(case)
     memory = Memory(config.joints)
     try:
         play_in_simulation(config, request, memory)
-        metrics = measure(memory.samples(), stat_start_s=STAT_START_S, end_s=DURATION_S)
+        samples = memory.samples()
+        metrics = measure(samples, stat_start_s=STAT_START_S, end_s=DURATION_S)
     except (SimulationError, Refusal, MetricsError) as error:
-        return Row(case, failed=str(error))
-    samples = memory.samples()
+        return Row(case, failed=str(error), cpu_s=process_time() - began_s)
     effort = np.sqrt(np.mean(samples["tau_sent_Nm"] ** 2, axis=0))
     tracking = metrics.true or metrics.measured
     return Row(
@@ -212,30 +242,54 @@ def run_case(case: Case) -> Row:
         tv_Nm_s=metrics.tv_Nm_s,
         Kd_min=metrics.Kd_min,
         Kd_max=metrics.Kd_max,
+        cpu_s=process_time() - began_s,
     )
 
 
-def compare(wanted: Sequence[Case], processes: int, on_row: Callable[[], object]) -> list[Row]:
+def compare(
+    wanted: Sequence[Case],
+    processes: int,
+    on_row: Callable[[Row], object],
+    known: Mapping[Case, Row] = MappingProxyType({}),
+) -> list[Row]:
     """Run all cases on several cores and return their rows in the order of the cases.
 
     Args:
         wanted: Cases; those of the clipped law are completed from the reference law's peak torque,
             which is simulated even where it was not asked for.
         processes: How many run at once.
-        on_row: Called after each run.
+        on_row: Called with the row of each run, as it ends.
+        known: Rows of cases that need not be run again.
+
+    Raises:
+        CompareError: If a process was killed from outside.
     """
     clipped = [case for case in wanted if case.law == CLIPPED]
     first = list(
         dict.fromkeys([*(c for c in wanted if c.law != CLIPPED), *map(_unclipped, clipped)])
     )
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        rows = dict(_run_all(pool, first, on_row))
+    spawn = get_context("spawn")
+    pool = ProcessPoolExecutor(processes, spawn, _begin_worker, (os.getpid(),))
+    try:
+        rows = _run_all(pool, first, on_row, known)
         second = {
             case: replace(case, tau_clip_Nm=rows[_unclipped(case)].peak_tau_Nm or None)
             for case in clipped
         }
-        late = dict(_run_all(pool, list(second.values()), on_row))
+        late = _run_all(pool, list(second.values()), on_row, known)
+    except BrokenProcessPool as error:
+        raise CompareError(
+            "a run's process was killed; is there memory for all of them?"
+        ) from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
     return [late[second[case]] if case in second else rows[case] for case in wanted]
+
+
+def _begin_worker(parent_pid: int) -> None:
+    """Leave an interruption to the parent, which ends the pool; go when the parent has gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    die_with_parent(parent_pid)
 
 
 def _unclipped(case: Case) -> Case:
@@ -243,80 +297,15 @@ def _unclipped(case: Case) -> Case:
 
 
 def _run_all(
-    pool: ProcessPoolExecutor, some: Sequence[Case], on_row: Callable[[], object]
-) -> Iterator[tuple[Case, Row]]:
-    for done in as_completed([pool.submit(run_case, case) for case in some]):
+    pool: ProcessPoolExecutor,
+    some: Sequence[Case],
+    on_row: Callable[[Row], object],
+    known: Mapping[Case, Row],
+) -> dict[Case, Row]:
+    rows = {case: known[case] for case in some if case in known}
+    waiting = [pool.submit(run_case, case) for case in some if case not in known]
+    for done in as_completed(waiting):
         row = done.result()
-        on_row()
-        yield row.case, row
-
-
-# --- output --------------------------------------------------------------------------------------
-
-
-def to_csv(rows: Sequence[Row]) -> str:
-    """Return every figure of every run, one line per run."""
-    joints = max((len(row.rms_counts) for row in rows), default=0)
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    names = [f"{_split_unit(name, j)}" for name in FIGURES for j in range(1, joints + 1)]
-    writer.writerow(["law", "scenario", "perturbation", "failed", *names])
-    for row in rows:
-        values = [v for name in FIGURES for v in _padded(getattr(row, name), joints)]
-        case = row.case
-        writer.writerow([case.law, case.scenario, case.perturbation, row.failed, *values])
-    return stream.getvalue()
-
-
-def _split_unit(name: str, joint: int) -> str:
-    """`rms_counts` -> `rms_1_counts`, as in exported recordings; names without unit get it last."""
-    stem, _, unit = name.partition("_")
-    if name in ("Kd_min", "Kd_max"):
-        return f"{name}_{joint}"
-    if stem == "peak" and unit.startswith("tau"):
-        return f"peak_tau_{joint}_Nm"
-    return f"{stem}_{joint}_{unit}"
-
-
-def _padded(values: tuple[float, ...], joints: int) -> list[float | str]:
-    return [*values, *[""] * (joints - len(values))]
-
-
-COLUMNS: Final = (
-    ("rms [counts]", "rms_counts", "{:.2f}"),
-    ("peak [counts]", "peak_counts", "{:.2f}"),
-    ("settled [s]", "ts20_s", "{:.2f}"),
-    ("rate [1/s]", "rate10_1_s", "{:.0f}"),
-    ("peak torque [Nm]", "peak_tau_Nm", "{:.2f}"),
-    ("effort [Nm rms]", "effort_Nm", "{:.3f}"),
-    ("variation [Nm/s]", "tv_Nm_s", "{:.0f}"),
-    ("Kd", "", ""),
-)
-
-
-def to_markdown(rows: Sequence[Row]) -> str:
-    """Return one table per scenario and perturbation, joint 1 / joint 2."""
-    lines: list[str] = []
-    groups = dict.fromkeys((row.case.scenario, row.case.perturbation) for row in rows)
-    for scenario, perturbation in groups:
-        lines += [f"### {scenario}, {perturbation}", ""]
-        lines += ["| law | " + " | ".join(title for title, *_ in COLUMNS) + " |"]
-        lines += ["|---" * (len(COLUMNS) + 1) + "|"]
-        for row in rows:
-            if (row.case.scenario, row.case.perturbation) == (scenario, perturbation):
-                lines.append(f"| {row.case.law} | " + " | ".join(_cells(row)) + " |")
-        lines.append("")
-    return "\n".join(lines)
-
-
-def _cells(row: Row) -> Iterator[str]:
-    if row.failed:
-        yield f"tripped: {row.failed}"
-        yield from [""] * (len(COLUMNS) - 1)
-        return
-    for _, name, layout in COLUMNS:
-        if name:
-            yield " / ".join(layout.format(value) for value in getattr(row, name))
-        else:
-            pairs = zip(row.Kd_min, row.Kd_max, strict=True)
-            yield " / ".join(f"{low:.2f}..{high:.2f}" for low, high in pairs)
+        on_row(row)
+        rows[row.case] = row
+    return rows

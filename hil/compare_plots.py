@@ -45,7 +45,10 @@ def _scatter(
     joint: int,
     names: tuple[list[str], list[str]],
 ) -> None:
+    from matplotlib import colormaps
+
     laws, perturbations = names
+    colours = colormaps["tab10" if len(laws) <= 10 else "tab20"]
     for row in rows:
         law, perturbation = laws.index(row.case.law), perturbations.index(row.case.perturbation)
         axes.plot(
@@ -53,10 +56,10 @@ def _scatter(
             row.rms_counts[joint],
             linestyle="",
             marker=MARKERS[perturbation % len(MARKERS)],
-            color=f"C{law}",
+            color=colours(law),
         )
     for number, law_name in enumerate(laws):
-        axes.plot([], [], color=f"C{number}", linewidth=4, label=law_name)
+        axes.plot([], [], color=colours(number), linewidth=4, label=law_name)
     for number, name in enumerate(perturbations):
         axes.plot([], [], "k", linestyle="", marker=MARKERS[number % len(MARKERS)], label=name)
     axes.set_xscale("log")

@@ -22,7 +22,7 @@ from controller.settings import ControllerSettings, LinkModel, ModelSettings
 from drivers.bus import split_address
 from drivers.cia402.settings import Cia402Settings
 from drivers.errors import DriverError
-from drivers.registry import SETTINGS, AnyAxisSettings
+from drivers.registry import SETTINGS, AnyAxisSettings, find_clash
 from hil.errors import HilError
 from sim_backend.errors import SimError
 from sim_backend.presets import plant_preset, servo_preset
@@ -51,6 +51,9 @@ class BusSettings(_Settings):
 
     address: str = Field("unix:/tmp/hil-bench.sock", description="see `hil run --help`")
     bit_rate: int = Field(1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the budget")
+    data_bit_rate: int = Field(
+        5_000_000, ge=10_000, le=8_000_000, description="the same for the data of CAN FD frames"
+    )
 
 
 class LoopSettings(_Settings):
@@ -157,6 +160,8 @@ class Config(BaseSettings):
         if len(set(nodes)) != joints:
             shown = ", ".join(f"{family} {node}" for family, node in nodes)
             raise ValueError(f"axes: node ids ({shown}) are not all different")
+        if clash := find_clash(self.axes):
+            raise ValueError(f"axes: {clash}")
         if self.loop.feedback_timeout_s >= self.loop.period_s:
             raise ValueError("loop.feedback_timeout_s must be shorter than loop.period_s")
         return self

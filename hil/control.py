@@ -16,7 +16,7 @@ from controller.player import ReferencePlayer, Setpoint
 from controller.registry import make_law
 from controller.velocity import VelocityEstimator, make_estimator
 from drivers.axis import Axis, AxisStatus
-from drivers.errors import BusError
+from drivers.errors import BusDownError, BusError
 from hil.config import Config, ConfigError
 
 AT_REST_RAD_S = 0.05
@@ -114,14 +114,27 @@ class Control:
             periods: Periods of the plant's time since the last cycle, 1 unless some were skipped.
 
         Raises:
-            BusError: If the bus is gone. The fault is latched; torque cannot be commanded.
+            BusError: If the bus is gone for good. The fault is latched; torque cannot be commanded.
         """
         try:
-            self._bus.request_feedback()
-            is_fresh = self._bus.collect(deadline_ns)
+            self._exchange(deadline_ns, periods)
+        except BusDownError as error:
+            self._rest_without_bus(error)
         except BusError:
             self._trip(FaultCode.BUS_FAILED)
             raise
+
+    def _rest_without_bus(self, error: BusDownError) -> None:
+        """The bus is away for a while: latch that, once; the drives' watchdogs remove torque."""
+        self.feedback_ns = self.law_ns = self._now_ns()
+        self._age += 1
+        if self.machine.fault is FaultCode.NONE:
+            self._trip(FaultCode.BUS_FAILED, detail=str(error))
+        self.tau_sent_Nm = self._rest()
+
+    def _exchange(self, deadline_ns: int, periods: int) -> None:
+        self._bus.request_feedback()
+        is_fresh = self._bus.collect(deadline_ns)
         self.feedback_ns = self._now_ns()
         self._take_feedback(is_fresh, periods)
         self._check_amplifiers()
@@ -196,6 +209,9 @@ class Control:
         if code is FaultCode.ESTIMATOR_LOST:
             return {"detail": "the velocity estimate lost the encoder; raise C or slow down"}
         guard = self._guard
+        if code is FaultCode.NOT_FINITE:  # what JSON has no number for is told in words
+            told = f"joint {guard.joint}: a measurement or the reference is {guard.value}"
+            return {"joint": guard.joint, "value": None, "limit": None, "detail": told}
         return {"joint": guard.joint, "value": guard.value, "limit": guard.limit}
 
     def _damp(self) -> list[float]:

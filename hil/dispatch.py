@@ -10,6 +10,7 @@ import traceback
 from dataclasses import dataclass, field
 from time import monotonic, sleep
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -260,7 +261,12 @@ class Dispatcher:
         slot = self._free_slot()
         rows = reference.rows()
         self._rows(slot, rows.size)[:] = rows.ravel()
-        command = {"slot": slot, "samples": reference.samples, "at_index": at_index}
+        command = {
+            "slot": slot,
+            "samples": reference.samples,
+            "at_index": at_index,
+            "crc32": crc32(rows.tobytes()),
+        }
         return self._post("trajectory", command, (slot, reference.samples))
 
     def _junction(self, lead_s: float) -> tuple[int | None, MotionState]:

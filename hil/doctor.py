@@ -12,7 +12,7 @@ from typing import Literal
 
 from drivers.bus import open_bus, split_address
 from drivers.errors import DriverError
-from hil.budget import bus_load
+from hil.budget import REMEDY, WARNING_SHARE, bus_budget
 from hil.config import Config
 
 Level = Literal["pass", "warn", "fail"]
@@ -39,7 +39,7 @@ def examine(config: Config) -> list[Finding]:
         _governor,
         _clock,
         _bus,
-        _bus_load,
+        check_bus_load,
         _zenoh,
     )
     return [check(config) for check in checks]
@@ -140,12 +140,15 @@ def _bus(config: Config) -> Finding:
     return Finding("bus", "pass", f"{address} can be joined, send queue of {queue} frames")
 
 
-def _bus_load(config: Config) -> Finding:
-    bits, share = bus_load(config)
-    found = f"worst case {bits} bits a cycle, {100 * share:.1f} % of the period"
-    if share > 0.9:
-        return Finding("bus load", "fail", found, "fewer axes, a longer period or a faster bus")
-    return Finding("bus load", "pass" if share < 0.75 else "warn", found)
+def check_bus_load(config: Config) -> Finding:
+    """Judge the bus budget alone (`hil.budget`)."""
+    budget = bus_budget(config)
+    found = f"a cycle needs {100 * budget.share:.1f} % of the period at worst"
+    if not budget.is_fitting:
+        return Finding("bus load", "fail", f"{found}: {budget.arithmetic()}", REMEDY)
+    if budget.share > WARNING_SHARE:
+        return Finding("bus load", "warn", found, REMEDY)
+    return Finding("bus load", "pass", found)
 
 
 def _zenoh(config: Config) -> Finding:

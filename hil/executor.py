@@ -1,13 +1,17 @@
 """Carries out commands inside the loop, at most a few a cycle, and says what became of them.
 
 Commands come from the gateway already checked against the configuration; what is left to check
-here is the state at the very cycle in which they take effect.
+here is the state at the very cycle in which they take effect. Whatever else reaches the arm from
+outside of the bus (the emergency-stop word, signals, lost processes) comes in as a command too, so
+that a recording of commands and frames is all that a replay needs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from controller.errors import CommandError
+from controller.faults import FaultCode
+from controller.machine import State
 from hil.control import Control
 
 Rows = Callable[[int], Sequence[float]]
@@ -24,6 +28,7 @@ class Executor:
     Attributes:
         active_slot: Slot of the trajectory that was started last, -1 before the first.
         active_samples: Its number of rows.
+        is_ending: The run is to end: every cycle asks for a damped stop.
     """
 
     def __init__(self, control: Control, rows: Rows, outcome: Outcome) -> None:
@@ -33,6 +38,7 @@ class Executor:
         self._pending: Mapping[str, Any] | None = None
         self.active_slot = -1
         self.active_samples = 0
+        self.is_ending = False
         self._verbs: dict[str, Callable[[Mapping[str, Any]], None]] = {
             "enable": lambda _: control.enable(),
             "disable": self._disable,
@@ -41,10 +47,17 @@ class Executor:
             "reset": lambda _: control.reset(),
             "gain_bounds": lambda c: control.set_gain_bounds(c["Kd_min"], c["Kd_max"]),
             "fault": lambda c: control.inject_fault(c["joint"]),
+            "end": self._end,
+            "supervisor_lost": self._lose_supervisor,
+            "gateway_lost": self._lose_gateway,
         }
 
     def execute(self, command: Mapping[str, Any]) -> None:
-        """Carry out one command now, or keep a trajectory for the row it is meant for."""
+        """Carry out one command now, or keep a trajectory for the row it is meant for.
+
+        Args:
+            command: `verb`, its arguments, and `id` if somebody waits for the outcome.
+        """
         if command["verb"] == "trajectory":
             self._drop_pending("replaced by a later trajectory")
             self._pending = command
@@ -53,6 +66,8 @@ class Executor:
 
     def begin_cycle(self, periods: int) -> None:
         """Start the waiting trajectory if this is its cycle; call once a cycle, before the law."""
+        if self.is_ending:
+            self._control.disable()
         command = self._pending
         if command is None:
             return
@@ -78,6 +93,22 @@ class Executor:
         self._drop_pending("emergency stop")
         self._control.estop()
 
+    def _end(self, _: Mapping[str, Any]) -> None:
+        self.is_ending = True
+
+    def _lose_supervisor(self, _: Mapping[str, Any]) -> None:
+        self._control.trip(FaultCode.SUPERVISOR_LOST)
+        self.is_ending = True
+
+    def _lose_gateway(self, command: Mapping[str, Any]) -> None:
+        control = self._control
+        control.trip(FaultCode.GATEWAY_LOST)
+        state = control.machine.state
+        if command["policy"] == "hold" and state is State.ACTIVE:
+            control.stop()
+        elif command["policy"] == "stop" and state.is_powered:
+            control.disable()
+
     def _drop_pending(self, reason: str) -> None:
         command, self._pending = self._pending, None
         if command is not None:
@@ -89,6 +120,8 @@ class Executor:
         try:
             action(command)
         except CommandError as error:
-            self._outcome(command, str(error))
+            reason = str(error)
         else:
-            self._outcome(command, "")
+            reason = ""
+        if "id" in command:
+            self._outcome(command, reason)

@@ -57,6 +57,9 @@ class Memory:
     def add_bus_log(self, t_ns: int, payload: bytes) -> None:
         """Let frames go."""
 
+    def add_trajectory(self, t_ns: int, crc: int, rows: bytes) -> None:
+        """Let a reference go."""
+
     def add_event(
         self, t_ns: int, cycle: int, kind: str, detail: Mapping[str, Any] | str = "{}"
     ) -> None:

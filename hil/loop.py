@@ -5,12 +5,11 @@ import os
 import platform
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from time import thread_time_ns
 from typing import Any
 
-from controller.faults import FaultCode
-from controller.machine import State, Trigger
+from controller.machine import Trigger
 from drivers.arm_bus import ArmBus
 from drivers.axis import AxisInfo
 from drivers.bus import open_bus
@@ -30,7 +29,8 @@ from hil.realtime import (
     usage,
 )
 from hil.sampler import Sampler, Stamps
-from hil.shared import FRAMES_AT_ONCE, STATUS_EVERY_S, SharedMemory
+from hil.shared import STATUS_EVERY_S, SharedMemory
+from hil.telemetry import LoggedFrame
 
 GATEWAY_TIMEOUT_NS = 2_000_000_000
 FAREWELL_CYCLES = 5
@@ -40,7 +40,21 @@ FAREWELL_CYCLES = 5
 class Loop:
     """The control loop on its shared memory."""
 
-    def __init__(self, shared: SharedMemory, bus: ArmBus, infos: list[AxisInfo]) -> None:
+    def __init__(
+        self,
+        shared: SharedMemory,
+        bus: ArmBus,
+        infos: list[AxisInfo],
+        start_up: Sequence[LoggedFrame] = (),
+    ) -> None:
+        """Make the loop ready to run.
+
+        Args:
+            shared: The daemon's shared memory.
+            bus: The configured amplifiers.
+            infos: What they said of themselves.
+            start_up: Every frame of their configuration.
+        """
         config = shared.config
         self._shared = shared
         self._config = config
@@ -60,10 +74,13 @@ class Loop:
         self._overruns = 0
         self._estops_seen = shared.estop_requests
         self._has_gateway = False
-        self._is_ending = False
+        self._must_end = False
         self._granted = Granted("SCHED_OTHER", memory_locked=False, missing=())
         self._entry = shared.frame_layout.entry
         self._frames: list[bytes] = []
+        self._record_bytes = self._room = shared.frames.payload_size
+        for t_ns, direction, frame in start_up:
+            self._append_entry(self._entry(t_ns, direction, frame))
 
     def run(self, granted: Granted) -> None:
         """Run cycles until a signal ends the loop and torque is off.
@@ -106,7 +123,7 @@ class Loop:
                 self._look_after()
             self._cycle += 1
             start_ns += self._period_ns
-            if self._is_ending and not self._control.machine.state.is_powered:
+            if self._executor.is_ending and not self._control.machine.state.is_powered:
                 farewell -= 1
         self._look_after()
 
@@ -114,11 +131,11 @@ class Loop:
         cpu_ns = thread_time_ns()
         if self._shared.estop_requests != self._estops_seen:
             self._estops_seen = self._shared.estop_requests
-            self._control.estop()
-        if self._is_ending:
-            self._control.disable()
+            self._take({"verb": "estop"})
+        if self._must_end and not self._executor.is_ending:
+            self._take({"verb": "end"})
         for record in self._commands.read(1):
-            self._executor.execute(json.loads(record))
+            self._take(json.loads(record))
         self._executor.begin_cycle(periods)
         self._control.step(start_ns + self._timeout_ns, periods)
         sent_ns = now_ns()
@@ -135,6 +152,11 @@ class Loop:
         ring.commit()
         self._flush_frames()
         self._shared.beat("loop", sent_ns)
+
+    def _take(self, command: Mapping[str, Any], *, is_after_step: bool = False) -> None:
+        """Carry out what came from outside of the bus, and record it first."""
+        self._emit("input", {"is_after_step": is_after_step, "command": command})
+        self._executor.execute(command)
 
     # --- every 100 ms ------------------------------------------------------------------------
 
@@ -167,21 +189,15 @@ class Loop:
         )
 
     def _watch_supervisor(self) -> None:
-        if os.getppid() != self._parent and not self._is_ending:
-            self._control.trip(FaultCode.SUPERVISOR_LOST)
-            self._is_ending = True
+        if os.getppid() != self._parent and not self._executor.is_ending:
+            self._take({"verb": "supervisor_lost"}, is_after_step=True)
 
     def _watch_gateway(self) -> None:
         beat_ns = self._shared.last_beat("gateway")
         is_there = beat_ns > 0 and now_ns() - beat_ns < GATEWAY_TIMEOUT_NS
         if self._has_gateway and not is_there:
-            self._control.trip(FaultCode.GATEWAY_LOST)
             policy = self._config.loop.on_gateway_loss
-            state = self._control.machine.state
-            if policy == "hold" and state is State.ACTIVE:
-                self._control.stop()
-            elif policy == "stop" and state.is_powered:
-                self._control.disable()
+            self._take({"verb": "gateway_lost", "policy": policy}, is_after_step=True)
         self._has_gateway = is_there
 
     # --- reporting ---------------------------------------------------------------------------
@@ -197,21 +213,33 @@ class Loop:
         )
 
     def _log_frame(self, direction: int, frame: bytes) -> None:
-        self._frames.append(self._entry(now_ns(), direction, frame))
-        if len(self._frames) == FRAMES_AT_ONCE:
+        self._append_entry(self._entry(now_ns(), direction, frame))
+
+    def _append_entry(self, entry: bytes) -> None:
+        self._room -= len(entry)
+        if self._room < 0:
             self._flush_frames()
+            self._room -= len(entry)
+        self._frames.append(entry)
 
     def _flush_frames(self) -> None:
         self._shared.frames.append(b"".join(self._frames))
         self._frames.clear()
+        self._room = self._record_bytes
 
     def _end(self, *_: object) -> None:
         """Signal handler: from the next cycle on, come to a damped stop, then end."""
-        self._is_ending = True
+        self._must_end = True
 
 
-def open_arm(config: Config) -> tuple[ArmBus, list[AxisInfo]]:
+def open_arm(
+    config: Config, start_up: list[LoggedFrame] | None = None
+) -> tuple[ArmBus, list[AxisInfo]]:
     """Join the bus and set up every amplifier, disabled.
+
+    Args:
+        config: Bus and axes.
+        start_up: Takes every frame of the set-up, if given.
 
     Raises:
         DriverError: If the bus or an amplifier is not there or not as configured.
@@ -220,6 +248,8 @@ def open_arm(config: Config) -> tuple[ArmBus, list[AxisInfo]]:
     bus = ArmBus(
         open_bus(config.bus.address), make_axes(config.axes, period_s=period_s), now_ns=now_ns
     )
+    if start_up is not None:
+        bus.log_frames(lambda way, frame: start_up.append(LoggedFrame(now_ns(), way, frame)))
     try:
         cycles = heartbeat_cycles(config.axes, period_s=period_s)
         return bus, bus.configure(heartbeat_cycles=cycles)
@@ -236,15 +266,16 @@ def main(shared_fd: int, parent_pid: int) -> int:
     """
     die_with_parent(parent_pid)
     shared = SharedMemory(shared_fd)
+    start_up: list[LoggedFrame] = []
     try:
-        bus, infos = open_arm(shared.config)
+        bus, infos = open_arm(shared.config, start_up)
     except DriverError as error:
         print(f"hil: {error}", file=sys.stderr)  # noqa: T201 - the line the user is promised
         return 1
     try:
         granted = make_realtime(shared.config.loop)
         freeze_garbage()
-        Loop(shared, bus, infos).run(granted)
+        Loop(shared, bus, infos, start_up).run(granted)
     except (HilError, BusError) as error:
         print(f"hil: {error}", file=sys.stderr)  # noqa: T201 - the line the user is promised
         return 1

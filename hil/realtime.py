@@ -1,6 +1,7 @@
 """What the operating system gives a real-time thread: scheduler, memory, timer, accounting."""
 
 import ctypes
+import errno
 import gc
 import os
 import resource
@@ -41,9 +42,10 @@ class Sleeper:
         self._sleep = _libc.clock_nanosleep
 
     def until(self, t_ns: int) -> None:
-        """Return at `t_ns`, or as soon after it as the scheduler allows; signals end it early."""
+        """Return at `t_ns`, or as soon after it as the scheduler allows, whatever signals come."""
         self._time.tv_sec, self._time.tv_nsec = divmod(t_ns, 1_000_000_000)
-        self._sleep(CLOCK_MONOTONIC, _TIMER_ABSTIME, self._reference, None)
+        while self._sleep(CLOCK_MONOTONIC, _TIMER_ABSTIME, self._reference, None) == errno.EINTR:
+            pass
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,11 @@ before.
 
 import signal
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from time import sleep
+from typing import Any
+from zlib import crc32
 
 from hil.errors import HilError
 from hil.process import outlast_loop
@@ -44,14 +47,23 @@ class Recorder:
                 self._writer.add_sample(t_ns, seq, record)
         while records := self._frames.read(AT_ONCE):
             log = b"".join(records)
-            first = self._shared.frame_layout.decode_log(log[: self._shared.frame_layout.size])[0]
-            self._writer.add_bus_log(first.t_ns, log)
+            if log:
+                self._writer.add_bus_log(self._shared.frame_layout.first_t_ns(log), log)
         for event in self._events.read_json(AT_ONCE):
             t_ns, cycle, kind = event.pop("t_ns"), event.pop("cycle"), event.pop("kind")
             self._writer.add_event(t_ns, cycle, kind, event)
+            if kind == "input" and event["command"]["verb"] == "trajectory":
+                self._add_trajectory(t_ns, event["command"])
         self._writer.flush()
         for reader in (self._samples, self._frames, self._events):
             reader.commit()
+
+    def _add_trajectory(self, t_ns: int, command: Mapping[str, Any]) -> None:
+        """Keep the reference, unless its slot has been written anew: then its CRC tells."""
+        size = command["samples"] * self._shared.config.joints * 3 * 8
+        rows = bytes(self._shared.slot(command["slot"])[:size])
+        if crc32(rows) == command["crc32"]:
+            self._writer.add_trajectory(t_ns, command["crc32"], rows)
 
     @property
     def is_empty(self) -> bool:

@@ -1,9 +1,10 @@
 """Recordings: one MCAP file per run, Protobuf inside, readable after a kill.
 
 Channels `telemetry` (`hil.v1.Sample`, one message per sample), `bus` (`hil.v1.BusLog`, one
-message per drained batch) and `event` (`hil.v1.Event`); the running configuration is the
-metadata record `config`. The file holds nothing but what was recorded (no wall-clock time, no
-host, no version), so that the same run written twice gives the same bytes.
+message per drained batch) and `event` (`hil.v1.Event`); the references that were played are
+attachments, and the running configuration is the metadata record `config`. The file holds nothing
+but what was recorded (no wall-clock time, no host, no version), so that the same run written twice
+gives the same bytes.
 """
 
 import json
@@ -14,12 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Final, Self
+from zlib import crc32
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
-from mcap.records import Channel, Metadata
+from mcap.records import Attachment, Channel, Metadata
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, Writer
@@ -33,6 +35,8 @@ from hil.telemetry import BusFrameLayout, LoggedFrame, SampleLayout, TelemetryEr
 FLUSH_PERIOD_NS: Final = 100_000_000
 """Recorded time after which a chunk is closed and handed to the kernel: what a kill can cost."""
 _CONFIG: Final = "config"
+_ROWS_NAME: Final = "trajectory-{:08x}.f64"
+_ROWS_TYPE: Final = "application/octet-stream"
 _MOST_JOINTS: Final = 255  # more is a damaged file
 _BLOCK: Final = 4096  # samples decoded at a time
 _DAMAGE: Final = (McapError, ZstdError, struct.error, ValueError, RuntimeError, MemoryError)
@@ -127,6 +131,22 @@ class RecordingWriter:
         text = detail if isinstance(detail, str) else json.dumps(detail, sort_keys=True)
         event = telemetry_pb2.Event(t_ns=t_ns, cycle=cycle, kind=kind, detail=text)
         self._add(self._event, t_ns, event.SerializeToString(), 0)
+
+    def add_trajectory(self, t_ns: int, crc: int, rows: bytes) -> None:
+        """Add the reference that a trajectory command started, as an attachment.
+
+        Args:
+            t_ns: Instant of the command on the samples' clock.
+            crc: CRC-32 of `rows`; the command names its reference by it.
+            rows: Doubles in host order, one row a period: q, dq, ddq of all joints.
+
+        Raises:
+            RecordingError: As for `add_sample`.
+        """
+        try:
+            self._writer.add_attachment(t_ns, t_ns, _ROWS_NAME.format(crc), _ROWS_TYPE, rows)
+        except OSError as error:
+            raise self._write_error(error) from error
 
     def _add(self, channel: int, t_ns: int, payload: bytes, seq: int) -> None:
         try:
@@ -257,6 +277,19 @@ class Recording:
                         raise RecordingError(f"recording {self.path}: {error}") from error
 
 
+    def trajectories(self) -> dict[int, bytes]:
+        """Read the references that were played: CRC-32 -> rows (`RecordingWriter.add_trajectory`).
+
+        Raises:
+            RecordingError: If the file is gone.
+        """
+        with _open_mcap(self.path) as file:
+            reader = _Reader(self.path, file)
+            for _ in reader:
+                pass
+            return reader.trajectories
+
+
 def _open_mcap(path: Path) -> BinaryIO:
     try:
         file = path.open("rb")
@@ -277,6 +310,7 @@ class _Reader:
         self.path = path
         self.is_truncated = False
         self.metadata: dict[str, str] = {}
+        self.trajectories: dict[int, bytes] = {}
         size = path.stat().st_size
         self._stream = StreamReader(file, validate_crcs=True, record_size_limit=size)
 
@@ -290,6 +324,8 @@ class _Reader:
                     topics[record.id] = record.topic
                 elif isinstance(record, Metadata) and record.name == _CONFIG:
                     self.metadata = record.metadata
+                elif isinstance(record, Attachment):
+                    self.trajectories[crc32(record.data)] = record.data
         except _DAMAGE:
             self.is_truncated = True
 

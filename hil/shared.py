@@ -34,7 +34,7 @@ STATUS_EVERY_S: Final = 0.1
 RING_S: Final = 8.0
 """How far back the samples and bus frames reach."""
 FRAMES_AT_ONCE: Final = 16
-"""Bus frames in one record, at most."""
+"""Bus frames in one record, at most; fewer if they are CAN FD frames that nobody announced."""
 SLOTS: Final = 3
 """Trajectory slots: one being played, one waiting, one being written."""
 
@@ -56,6 +56,11 @@ class Ring:
         self._payload_size = payload_size
         self._next: int = self._words[0]
         self._at = 0
+
+    @property
+    def payload_size(self) -> int:
+        """Bytes of the longest record."""
+        return self._payload_size
 
     @staticmethod
     def size(payload_size: int, slots: int) -> int:
@@ -194,7 +199,7 @@ class SharedMemory:
         self.config: Config = config_from_json(bytes(self._memory[8 : 8 + length]))
         self.layout = SampleLayout(self.config.joints, with_truth=False)
         self.frame_layout = BusFrameLayout()
-        self._plan = _plan(self.config, self.layout.size, self.frame_layout.size)
+        self._plan = _plan(self.config, self.layout.size, self.frame_layout)
         self.samples = self._ring("samples")
         self.frames = self._ring("frames")
         self.events = self._ring("events")
@@ -207,7 +212,7 @@ class SharedMemory:
     def create(cls, config: Config) -> Self:
         """Make the memory file for a configuration and write it there."""
         layout = SampleLayout(config.joints, with_truth=False)
-        plan = _plan(config, layout.size, BusFrameLayout().size)
+        plan = _plan(config, layout.size, BusFrameLayout())
         fd = os.memfd_create("hil", 0)
         os.ftruncate(fd, plan["end"][0])
         text = config.model_dump_json().encode()
@@ -277,8 +282,12 @@ class SharedMemory:
         return self._memory[start : start + size]
 
 
-def _plan(config: Config, sample_size: int, frame_size: int) -> dict[str, tuple[int, ...]]:
+def _plan(
+    config: Config, sample_size: int, frame_layout: BusFrameLayout
+) -> dict[str, tuple[int, ...]]:
     """Place every part: name -> (start, size[, payload size, slots]); `end` is the total."""
+    has_fd = any(f.is_fd for a in config.axes for f in a.cycle_frames(config.loop.period_s))
+    frame_size = frame_layout.fd_size if has_fd else frame_layout.size
     n, period_s = config.joints, config.loop.period_s
     rows = round(config.trajectory.max_duration_s / period_s) + 1
     cycles = round(RING_S / period_s)

@@ -6,6 +6,7 @@ Nothing here asks the real clock, so that the same run gives the same bytes.
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
+from zlib import crc32
 
 from controller.machine import State, Trigger
 from controller.reference import Reference
@@ -14,7 +15,7 @@ from drivers.buses.loopback import LoopbackBus
 from drivers.registry import heartbeat_cycles, make_axes
 from hil.config import Config
 from hil.control import ArmLink, Control
-from hil.emulation import build_emulator
+from hil.emulation import build_emulator, build_wired_emulator
 from hil.errors import HilError
 from hil.executor import Executor
 from hil.ideal import IdealArm
@@ -23,11 +24,15 @@ from hil.sampler import Sampler, Stamps
 from hil.telemetry import BusFrameLayout, SampleLayout
 from sim_backend.arm import Arm
 from sim_backend.emulator import Emulator
+from sim_backend.wire import WireLoad
+from sim_backend.wired import VirtualWire
 
 FRAMES_EVERY = 50
 """Cycles whose frames are recorded together."""
 NO_STAMPS = Stamps()
-"""Virtual time stands still within a cycle."""
+"""Without the wire model, virtual time stands still within a cycle."""
+WIRED_START_NS = 1_000_000
+"""With it, the first cycle begins at a multiple of this, as the plant's milliseconds do."""
 
 
 class SimulationError(HilError):
@@ -43,6 +48,9 @@ class Sink(Protocol):
     def add_bus_log(self, t_ns: int, payload: bytes) -> None:
         """Take some serialised bus frames."""
 
+    def add_trajectory(self, t_ns: int, crc: int, rows: bytes) -> None:
+        """Take the reference that a trajectory command starts."""
+
     def add_event(
         self, t_ns: int, cycle: int, kind: str, detail: Mapping[str, Any] | str = "{}"
     ) -> None:
@@ -57,6 +65,7 @@ class Simulation:
         control: The controller; commands are its methods.
         cycle: Cycles run so far.
         frames: Bus frames so far, both directions.
+        wire: The wire model, to look at or to disturb; None if it is off.
     """
 
     def __init__(self, config: Config, sink: Sink | None = None) -> None:
@@ -72,10 +81,13 @@ class Simulation:
         self._log_ns = 0
         self._emulator: Emulator | None = None
         self._plant: Emulator | IdealArm
+        self.wire: VirtualWire | None = None
+        self._timeout_ns = 0
         link: ArmLink
         self._plant, link = self._build_ideal() if config.emulator.is_ideal else self._build()
         self.control = Control(config, link, now_ns=lambda: self._clock_ns, events=self._emit)
         self._rows: dict[int, Sequence[float]] = {}
+        self._motion: tuple[Sequence[float], Sequence[float]] = (), ()
         self._executor = Executor(self.control, self._rows.__getitem__, self._report_outcome)
         layout = SampleLayout(config.joints, with_truth=True)
         self._sampler = Sampler(layout, self.control, link, self._truth)
@@ -88,8 +100,11 @@ class Simulation:
     def _build(self) -> tuple[Emulator, ArmBus]:
         """The emulated robot and the drivers in front of it, joined by an in-process bus."""
         config, loopback = self.config, LoopbackBus()
-        emulator = self._emulator = build_emulator(config, loopback.deliver, is_lockstep=True)
-        loopback.connect(emulator.receive, self._wait)
+        if config.emulator.wire.is_on:
+            emulator = self._build_wired(loopback)
+        else:
+            emulator = self._emulator = build_emulator(config, loopback.deliver, is_lockstep=True)
+            loopback.connect(emulator.receive, self._wait)
         axes = make_axes(config.axes, period_s=config.loop.period_s)
         bus = ArmBus(loopback, axes, now_ns=lambda: self._clock_ns)
         if self._sink is not None:
@@ -97,7 +112,27 @@ class Simulation:
         emulator.power_on()
         period_s = config.loop.period_s
         bus.configure(heartbeat_cycles=heartbeat_cycles(config.axes, period_s=period_s))
+        if self.wire is not None:
+            start_ns = -(-self._clock_ns // WIRED_START_NS) * WIRED_START_NS
+            self._clock_ns = self.wire.advance(start_ns)
         return emulator, bus
+
+    def _build_wired(self, loopback: LoopbackBus) -> Emulator:
+        """The emulated robot behind the wire model; feedback may come too late."""
+        config = self.config
+        wire = self.wire = VirtualWire(
+            config.emulator.wire,
+            loopback.deliver,
+            joints=config.joints,
+            bit_rate=config.bus.bit_rate,
+            data_bit_rate=config.bus.data_bit_rate,
+        )
+        emulator = build_wired_emulator(config, wire.ports)
+        wire.connect(emulator)
+        wire.model.on_window = self._report_load
+        loopback.connect(wire.send, self._wait_wired)
+        self._timeout_ns = round(config.loop.feedback_timeout_s * 1e9)
+        return emulator
 
     def _build_ideal(self) -> tuple[IdealArm, IdealArm]:
         link = IdealArm(Arm(self.config.plant), self.config.loop.period_s)
@@ -105,16 +140,31 @@ class Simulation:
 
     def step(self) -> None:
         """Run one cycle and record it."""
+        start_ns = self._clock_ns
         self._executor.begin_cycle(1)
-        self.control.step(self._clock_ns, 1)
-        stamp = (self.cycle, self._clock_ns, 0)
-        if self._sink is not None:
-            self._sampler.write(self._sample, 0, stamp, NO_STAMPS)
-            self._sink.add_sample(self._clock_ns, self._sampler.seq - 1, bytes(self._sample))
-            if self.cycle % FRAMES_EVERY == 0:
-                self._flush_frames()
+        self.control.step(start_ns + self._timeout_ns, 1)
+        if self.wire is None:
+            self._record(self._clock_ns, NO_STAMPS)
+            self._clock_ns += self._period_ns
+        else:
+            stamps = self._stamps(start_ns)
+            self._motion = self._plant.q_true_rad, self._plant.dq_true_rad_s
+            self._clock_ns = self.wire.advance(start_ns + self._period_ns)
+            self._record(start_ns, stamps)
         self.cycle += 1
-        self._clock_ns += self._period_ns
+
+    def _record(self, t_ns: int, stamps: Stamps) -> None:
+        if self._sink is None:
+            return
+        self._sampler.write(self._sample, 0, (self.cycle, t_ns, 0), stamps)
+        self._sink.add_sample(t_ns, self._sampler.seq - 1, bytes(self._sample))
+        if self.cycle % FRAMES_EVERY == 0:
+            self._flush_frames()
+
+    def _stamps(self, start_ns: int) -> Stamps:
+        control = self.control
+        done_ns = control.law_ns - start_ns
+        return Stamps(0, control.feedback_ns - start_ns, done_ns, done_ns, 0)
 
     def run(self, cycles: int, progress: Callable[[int], None] | None = None) -> None:
         """Run cycles, telling `progress` how many are done once per simulated second."""
@@ -142,20 +192,18 @@ class Simulation:
 
     def play(self, reference: Reference) -> None:
         """Start a compiled reference at the next cycle, as the trajectory command does."""
-        self._rows[0] = memoryview(reference.rows().tobytes()).cast("d")
-        self._executor.execute(
-            {
-                "id": 0,
-                "verb": "trajectory",
-                "slot": 0,
-                "samples": reference.samples,
-                "at_index": None,
-            }
-        )
+        rows = reference.rows().tobytes()
+        self._rows[0] = memoryview(rows).cast("d")
+        crc = crc32(rows)
+        if self._sink is not None:
+            self._sink.add_trajectory(self._clock_ns, crc, rows)
+        self.execute("trajectory", slot=0, samples=reference.samples, at_index=None, crc32=crc)
 
     def execute(self, verb: str, **arguments: object) -> None:
         """Carry out another command now (`Executor.execute`)."""
-        self._executor.execute({"id": 0, "verb": verb, **arguments})
+        command = {"id": 0, "verb": verb, **arguments}
+        self._emit("input", {"is_after_step": False, "command": command})
+        self._executor.execute(command)
 
     # --- time and records --------------------------------------------------------------------
 
@@ -166,9 +214,23 @@ class Simulation:
         if self._is_starting and self._emulator is not None:
             self._emulator.advance(passed_ns)
 
+    def _wait_wired(self, timeout_s: float) -> None:
+        """Nothing on hand: time passes until a frame arrives or the time is up."""
+        if self.wire is not None:
+            until_ns = self._clock_ns + round(timeout_s * 1e9)
+            self._clock_ns = self.wire.advance(until_ns, stops_at_host=True)
+
     def _truth(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
         plant = self._plant
+        if self.wire is not None:  # the plant has moved on to the end of the cycle
+            return *self._motion, plant.tau_applied_Nm
         return plant.q_true_rad, plant.dq_true_rad_s, plant.tau_applied_Nm
+
+    def _report_load(self, load: WireLoad) -> None:
+        if self.wire is not None:
+            share = round(self.wire.model.share(load), 6)
+            detail = {"share": share, "frames": load.frames, "error_frames": load.errors}
+            self._emit("bus_load", {**detail, "wait_max_s": load.wait_max_ns * 1e-9})
 
     def _emit(self, kind: str, detail: Mapping[str, Any]) -> None:
         if self._sink is not None:

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from drivers.frame import FD_FRAME_SIZE, FRAME_SIZE
 from hil.errors import HilError
 from hil.fixed_protobuf import FixedMessages, Records, delimited, fields_of, run_field, scalar_field
 from hil.proto import telemetry_pb2
@@ -197,36 +198,37 @@ def _parse_batch(payload: bytes) -> telemetry_pb2.SampleBatch:
 
 
 class BusFrameLayout:
-    """Where each value of a `hil.v1.BusFrame` stands, for one size of frame record.
-
-    Args:
-        frame_size: 16 for `struct can_frame`, 72 for `struct canfd_frame`.
+    """Where each value of a `hil.v1.BusFrame` stands, for either size of frame record.
 
     Attributes:
-        size: Bytes of one entry of a log.
+        size: Bytes of the entry of a classic frame in a log.
+        fd_size: Bytes of the entry of a CAN FD frame.
         entry: Serialises one frame as an entry of a `hil.v1.BusLog`: joined entries are a log. It
             takes (t_ns, direction, frame), the frame being exactly one record.
     """
 
-    def __init__(self, frame_size: int = 16) -> None:
-        t_ns, direction, frame = fields_of(telemetry_pb2.BusFrame)
-        self.frame_size: Final = frame_size
-        self._messages = FixedMessages(
-            (scalar_field(t_ns), scalar_field(direction), run_field(frame, "s", frame_size, 1))
-        )
-        self.size: Final = len(self._messages.prefix) + self._messages.size
+    def __init__(self) -> None:
+        self._classic, self._fd = _frame_messages(FRAME_SIZE), _frame_messages(FD_FRAME_SIZE)
+        self.size: Final = len(self._classic.prefix) + self._classic.size
+        self.fd_size: Final = len(self._fd.prefix) + self._fd.size
         self.entry: Final[FrameEntry] = self._entry()
+        before_time = len(self._classic.prefix) + len(self._classic.fields[0].constant)
+        self._first_time = struct.Struct(f"<{before_time}xq").unpack_from
 
     def _entry(self) -> FrameEntry:
-        at, way, data = (field.constant for field in self._messages.fields)
-        head = self._messages.prefix + at
-        layout = f"<{len(head)}sq{len(way)}sI{len(data)}s{self.frame_size}s"
-        pack = struct.Struct(layout).pack
+        pack, pack_fd = _frame_packer(self._classic), _frame_packer(self._fd)
 
         def entry(t_ns: int, direction: int, frame: bytes) -> bytes:
-            return pack(head, t_ns, way, direction, data, frame)
+            if len(frame) == FRAME_SIZE:
+                return pack(t_ns, direction, frame)
+            return pack_fd(t_ns, direction, frame)
 
         return entry
+
+    def first_t_ns(self, log: bytes) -> int:
+        """Return the instant of the first frame of a log that `entry` wrote; it is not empty."""
+        t_ns: int = self._first_time(log)[0]
+        return t_ns
 
     def decode_log(self, payload: bytes) -> list[LoggedFrame]:
         """Read a serialised `hil.v1.BusLog`, whoever wrote it, in the order of the log.
@@ -234,12 +236,28 @@ class BusFrameLayout:
         Raises:
             TelemetryError: If the bytes are not a bus log.
         """
-        rows = self._messages.split(payload)
-        if rows is not None:
-            return [LoggedFrame(t_ns, way, bytes(frame)) for t_ns, way, frame in rows.tolist()]
+        for messages in (self._classic, self._fd):
+            rows = messages.split(payload)
+            if rows is not None:
+                return [LoggedFrame(t_ns, way, bytes(frame)) for t_ns, way, frame in rows.tolist()]
         log = telemetry_pb2.BusLog()
         try:
             log.ParseFromString(payload)
         except DecodeError as error:
             raise TelemetryError(f"{len(payload)} bytes are not a bus log: {error}") from error
         return [LoggedFrame(f.t_ns, f.direction, f.frame) for f in log.frames]
+
+
+def _frame_messages(frame_size: int) -> FixedMessages:
+    t_ns, direction, frame = fields_of(telemetry_pb2.BusFrame)
+    return FixedMessages(
+        (scalar_field(t_ns), scalar_field(direction), run_field(frame, "s", frame_size, 1))
+    )
+
+
+def _frame_packer(messages: FixedMessages) -> FrameEntry:
+    at, way, data = (field.constant for field in messages.fields)
+    head = messages.prefix + at
+    frame_size = messages.fields[2].count
+    pack = struct.Struct(f"<{len(head)}sq{len(way)}sI{len(data)}s{frame_size}s").pack
+    return lambda t_ns, direction, frame: pack(head, t_ns, way, direction, data, frame)

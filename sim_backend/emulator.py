@@ -7,7 +7,7 @@ advances everything by one period; otherwise the caller passes the wall's time o
 
 from collections.abc import Sequence
 
-from drivers.frame import ERR_FLAG, FRAME_SIZE, LOCKSTEP_ID, RTR_FLAG, unpack_frame
+from drivers.frame import ERR_FLAG, FRAME_SIZE, LOCKSTEP_ID, RTR_FLAG, is_fd, unpack_frame
 from sim_backend.arm import Arm
 from sim_backend.chain import CURRENT_LOOP_PERIOD_NS
 from sim_backend.errors import SimError
@@ -45,10 +45,12 @@ class Emulator:
     __slots__ = (
         "_arm",
         "_cyclic_nodes",
+        "_fd_nodes",
         "_first_half_Nm",
         "_is_waiting",
         "_nodes",
         "_remainder_ns",
+        "_remote_nodes",
         "_sense",
         "_servos",
         "dq_true_rad_s",
@@ -75,6 +77,8 @@ class Emulator:
         self._cyclic_nodes = [
             n for n in nodes if type(n).begin_period is not AmplifierNode.begin_period
         ]
+        self._fd_nodes = [n for n in nodes if n.takes_fd]
+        self._remote_nodes = [n for n in nodes if n.takes_remote_requests]
         self.is_lockstep = is_lockstep
         self._is_waiting = arm.settings.is_held_until_enabled
         if self._is_waiting:
@@ -104,19 +108,22 @@ class Emulator:
     def receive(self, frame: bytes) -> None:
         """Take one frame from the wire.
 
-        Anything that is not a data frame is ignored. In lockstep a SYNC advances one period
-        after the nodes have answered it.
+        Error reports are ignored; CAN FD frames and remote requests are for the nodes that take
+        them. In lockstep a SYNC advances one period after the nodes have answered it.
 
         Args:
-            frame: 16-byte record (`drivers.frame`).
+            frame: Record of either size (`drivers.frame`).
 
         Raises:
             PlantError: If the arm broke down while advancing.
         """
         if len(frame) != FRAME_SIZE:
+            if is_fd(frame):
+                self._receive_fd(frame)
             return
         can_id, data = unpack_frame(frame)
         if can_id & _NOT_DATA:
+            self._receive_remote(can_id, data)
             return
         if can_id != SYNC_ID and can_id != LOCKSTEP_ID:  # noqa: PLR1714 - every frame
             for node in self._nodes:
@@ -128,6 +135,17 @@ class Emulator:
         if self.is_lockstep:
             self._begin_period()
             self.advance_period()
+
+    def _receive_remote(self, can_id: int, data: bytes) -> None:
+        if not can_id & ERR_FLAG:
+            for node in self._remote_nodes:
+                node.receive(can_id, data)
+
+    def _receive_fd(self, frame: bytes) -> None:
+        can_id, data = unpack_frame(frame)
+        if not can_id & _NOT_DATA:
+            for node in self._fd_nodes:
+                node.receive(can_id, data)
 
     def advance_period(self) -> None:
         """Advance by 1 ms: two current-loop periods.

@@ -1,4 +1,4 @@
-"""The emulator's side of a bus: it listens on the Unix bus, or joins any other one.
+"""The emulator's side of a bus: it listens on the Unix bus or a pty, or joins any other one.
 
 On the Unix bus the emulator is the wire. What one client sends goes to all other clients and to
 the emulator; what the emulator sends goes to all clients.
@@ -13,14 +13,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 from types import TracebackType
 from typing import Self
 
 from drivers.bus import Bus, open_bus, split_address
 from drivers.buses.unix import RECORD_LIMIT, enlarge_send_queue, is_hung_up
-from drivers.errors import BusError
-from drivers.frame import FRAME_SIZE
+from drivers.errors import BusDownError, BusError
+from drivers.frame import RECORD_SIZES
 from sim_backend.errors import SimError
 
 _BATCH = 64  # most frames handed over at once
@@ -32,9 +32,12 @@ _MODE = 0o660
 class Wire(ABC):
     """What the emulated amplifiers are connected to."""
 
+    address = ""
+    """Where to join, if that is not the address which the wire was opened with."""
+
     @abstractmethod
     def transmit(self, frame: bytes) -> None:
-        """Put one 16-byte record on the wire without blocking.
+        """Put one record (`drivers.frame`) on the wire without blocking.
 
         Raises:
             SimError: If the wire is gone.
@@ -79,13 +82,22 @@ def open_wire(address: str) -> Wire:
     """
     try:
         scheme, rest = split_address(address)
-        return UnixHub(rest) if scheme == "unix" else BusWire(open_bus(address))
+        if scheme == "unix":
+            return UnixHub(rest)
+        if scheme == "slcan" and rest.replace("=", ",").split(",")[0] == "pty":
+            from sim_backend.slcan_wire import SlcanPty
+
+            return SlcanPty(rest)
+        return BusWire(open_bus(address))
     except BusError as error:
         raise SimError(str(error)) from error
 
 
 class BusWire(Wire):
-    """A participant on a bus whose wire is elsewhere: SocketCAN, python-can."""
+    """A participant on a bus whose wire is elsewhere: SocketCAN, python-can.
+
+    While the bus is down, nothing arrives and what is sent is lost, as for real amplifiers.
+    """
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -94,6 +106,8 @@ class BusWire(Wire):
         """Send one frame; a full queue loses it, counted in the bus's `stats`."""
         try:
             self._bus.send(frame)
+        except BusDownError:
+            pass
         except BusError as error:
             raise SimError(str(error)) from error
 
@@ -106,6 +120,8 @@ class BusWire(Wire):
             while frame is not None:
                 frames.append(frame)
                 frame = recv(0.0) if len(frames) < _BATCH else None
+        except BusDownError:
+            sleep(timeout_s)
         except BusError as error:
             raise SimError(str(error)) from error
         return frames
@@ -211,18 +227,20 @@ class UnixHub(Wire):
                 record = client.recv(RECORD_LIMIT)
             except OSError:
                 continue  # it left with frames unread; its own last ones come with the next read
-            if len(record) == FRAME_SIZE:
+            if len(record) in RECORD_SIZES:
                 client.stats.frames_received += 1
-                self._relay(record, client)
-                frames.append(record)
+                if self._relay(record, client):
+                    frames.append(record)
             elif client.is_gone(record):
                 self._let_go(fd)
         return frames
 
-    def _relay(self, frame: bytes, sender: _Client) -> None:
+    def _relay(self, frame: bytes, sender: _Client) -> bool:
+        """Hand a frame to the other clients; True if it is for the emulator at once."""
         for client in self._clients.values():
             if client is not sender:
                 client.put(frame)
+        return True
 
     def _accept(self) -> None:
         """Take in all who have connected: nobody who waits here may miss a frame sent later."""
@@ -236,11 +254,20 @@ class UnixHub(Wire):
             return
         endpoint.setblocking(False)
         enlarge_send_queue(endpoint)
-        self._clients[endpoint.fileno()] = _Client(endpoint)
+        client = _Client(endpoint)
+        self._clients[endpoint.fileno()] = client
         self._readable.append(endpoint.fileno())
+        self._has_joined(client)
+
+    def _has_joined(self, client: _Client) -> None:
+        """Take notice of a client that has come."""
+
+    def _has_left(self, client: _Client) -> None:
+        """Take notice of a client that has gone."""
 
     def _let_go(self, fd: int) -> None:
         client = self._clients.pop(fd)
+        self._has_left(client)
         self._readable.remove(fd)
         self._lost_by_gone += client.stats.frames_lost
         client.endpoint.close()

@@ -6,11 +6,19 @@ from collections.abc import Callable
 from sim_backend.servo import Servo
 
 Transmit = Callable[[bytes], None]
-"""Puts one 16-byte frame record on the wire."""
+"""Puts one frame record (`drivers.frame`) on the wire."""
 
 
 class AmplifierNode(ABC):
-    """An emulated amplifier: protocol state machine between the wire and one `Servo`."""
+    """An emulated amplifier: protocol state machine between the wire and one `Servo`.
+
+    Attributes:
+        takes_fd: CAN FD frames are for it too; the others do not see them.
+        takes_remote_requests: The same of remote requests; their identifier has `RTR_FLAG`.
+    """
+
+    takes_fd = False
+    takes_remote_requests = False
 
     def __init__(self, servo: Servo, transmit: Transmit) -> None:
         self.servo = servo
@@ -26,7 +34,7 @@ class AmplifierNode(ABC):
 
         Args:
             can_id: Identifier with flags (`drivers.frame`).
-            data: 0 to 8 bytes.
+            data: 0 to 8 bytes, to 64 if it takes CAN FD.
         """
 
     @abstractmethod

@@ -165,6 +165,24 @@ class ServoSettings(_Settings):
     )
 
 
+class WireSettings(_Settings):
+    """The wire model: frame times to the bit, arbitration, errors. Its bit rates are the bus's."""
+
+    is_on: bool = Field(
+        False,
+        description="off: frames take no time. On, time runs as hardware's does: in virtual time "
+        "under `hil sim`, on the unix bus by the clock (`emulator.time`)",
+    )
+    bit_error_rate: float = Field(
+        0.0, ge=0, le=0.01, description="probability that a bit is disturbed, for all to see"
+    )
+    seed: int = Field(1, ge=0, description="of the generator of bit errors")
+    is_recovering: bool = Field(
+        True, description="a node that is bus-off returns after 128 times 11 recessive bits"
+    )
+    window_s: float = Field(1.0, gt=0, description="the bus load is reported over so long")
+
+
 class EmulatorSettings(_Settings):
     """How emulated time runs."""
 
@@ -182,6 +200,7 @@ class EmulatorSettings(_Settings):
         description="`hil sim` only: no frames, true position and velocity, torque after 0.5 ms "
         "delay and 0.5 ms lag",
     )
+    wire: WireSettings = Field(WireSettings(), description="the wire model, off by default")
 
 
 def _require_order(start: str, start_s: float, end: str, end_s: float | None) -> None:

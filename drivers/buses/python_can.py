@@ -10,7 +10,20 @@ import can
 
 from drivers.bus import Bus
 from drivers.errors import BusAddressError, BusError
-from drivers.frame import EFF_FLAG, EFF_MASK, ERR_FLAG, RTR_FLAG, SFF_MASK
+from drivers.frame import (
+    EFF_FLAG,
+    EFF_MASK,
+    ERR_FLAG,
+    FD_BRS,
+    FD_ESI,
+    FD_FLAGS_INDEX,
+    FD_LENGTHS,
+    RTR_FLAG,
+    SFF_MASK,
+    is_fd,
+    pack_fd_frame,
+    unpack_frame,
+)
 
 _LAYOUT = struct.Struct("=IB3x8s")
 _FAILURES = (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError)
@@ -20,13 +33,15 @@ _FULL = frozenset({errno.ENOBUFS, errno.EAGAIN})
 def to_message(
     frame: bytes, *, timestamp_s: float = 0.0, channel: str | None = None
 ) -> can.Message:
-    """Convert a 16-byte record into a python-can message.
+    """Convert a record into a python-can message.
 
     Args:
-        frame: The record; a length byte above 8 is read as 8.
+        frame: The record; a length byte above 8, or above 64 of CAN FD, is read as that.
         timestamp_s: Seconds since the epoch, as python-can has it.
         channel: Name of the bus, for python-can's printers and loggers.
     """
+    if is_fd(frame):
+        return _to_fd_message(frame, timestamp_s, channel)
     can_id, length, data = _LAYOUT.unpack(frame)
     length = min(length, 8)
     is_wide = bool(can_id & (EFF_FLAG | ERR_FLAG))
@@ -43,15 +58,34 @@ def to_message(
     )
 
 
+def _to_fd_message(frame: bytes, timestamp_s: float, channel: str | None) -> can.Message:
+    can_id, data = unpack_frame(frame)
+    flags = frame[FD_FLAGS_INDEX]
+    return can.Message(
+        timestamp=timestamp_s,
+        arbitration_id=can_id & (EFF_MASK if can_id & EFF_FLAG else SFF_MASK),
+        is_extended_id=bool(can_id & EFF_FLAG),
+        channel=channel,
+        dlc=len(data),
+        data=data,
+        is_fd=True,
+        bitrate_switch=bool(flags & FD_BRS),
+        error_state_indicator=bool(flags & FD_ESI),
+    )
+
+
 def from_message(message: can.Message) -> bytes | None:
-    """Convert a python-can message into a 16-byte record.
+    """Convert a python-can message into a record, of 72 bytes if it is CAN FD.
 
     Returns:
-        None if it is no classic frame: CAN FD, more than 8 bytes, identifier out of range.
+        None if it is no frame: too many bytes, a length that does not exist, identifier out of
+        range.
     """
+    if message.is_fd:
+        return _from_fd_message(message)
     is_wide = message.is_extended_id or message.is_error_frame
     can_id = message.arbitration_id
-    if message.is_fd or not 0 <= message.dlc <= 8 or len(message.data) > 8:
+    if not 0 <= message.dlc <= 8 or len(message.data) > 8:
         return None
     if not 0 <= can_id <= (EFF_MASK if is_wide else SFF_MASK):
         return None
@@ -64,11 +98,26 @@ def from_message(message: can.Message) -> bytes | None:
     return _LAYOUT.pack(can_id, message.dlc, bytes(message.data))
 
 
+def _from_fd_message(message: can.Message) -> bytes | None:
+    can_id = message.arbitration_id
+    if message.is_remote_frame or message.is_error_frame or len(message.data) not in FD_LENGTHS:
+        return None
+    if not 0 <= can_id <= (EFF_MASK if message.is_extended_id else SFF_MASK):
+        return None
+    if message.is_extended_id:
+        can_id |= EFF_FLAG
+    flags = FD_BRS if message.bitrate_switch else 0
+    if message.error_state_indicator:
+        flags |= FD_ESI
+    return pack_fd_frame(can_id, bytes(message.data), flags=flags)
+
+
 class PythonCanBus(Bus):
     """A bus reached through `can.Bus`.
 
     Args:
-        address: `INTERFACE:CHANNEL[@BITRATE]`, for example `pcan:PCAN_USBBUS1@1000000`. What the
+        address: `INTERFACE:CHANNEL[@BITRATE[/DATA_BITRATE]]`, for example
+            `kvaser:0@1000000/5000000`; a data bit rate opens the adapter for CAN FD. What the
             address does not name, python-can takes from its own configuration (`~/.canrc`,
             `CAN_BITRATE`), or the adapter's default.
 
@@ -155,14 +204,19 @@ class PythonCanBus(Bus):
 
 def _split(address: str) -> tuple[str, str, dict[str, Any]]:
     interface, _, rest = address.partition(":")
-    channel, at, bitrate = rest.rpartition("@")
-    if not at or not bitrate.isdecimal():
-        channel, bitrate = rest, ""
+    channel, at, rates = rest.rpartition("@")
+    bitrate, slash, data_bitrate = rates.partition("/")
+    if not at or not bitrate.isdecimal() or (slash and not data_bitrate.isdecimal()):
+        channel, bitrate, data_bitrate = rest, "", ""
     if not interface or not channel:
         raise BusAddressError(
-            f"bus address 'python-can:{address}' is not python-can:INTERFACE:CHANNEL[@BITRATE]"
+            f"bus address 'python-can:{address}' is not "
+            "python-can:INTERFACE:CHANNEL[@BITRATE[/DATA_BITRATE]]"
         )
-    return interface, channel, {"bitrate": int(bitrate)} if bitrate else {}
+    options: dict[str, Any] = {"bitrate": int(bitrate)} if bitrate else {}
+    if data_bitrate:
+        options |= {"data_bitrate": int(data_bitrate), "fd": True}
+    return interface, channel, options
 
 
 def _is_full(error: Exception) -> bool:

@@ -1,6 +1,7 @@
 """The Unix-socket bus: a client of the emulator's hub.
 
-`AF_UNIX` `SOCK_SEQPACKET`, one 16-byte `struct can_frame` per record, in the host's byte order.
+`AF_UNIX` `SOCK_SEQPACKET`, one `struct can_frame` (16 bytes) or `struct canfd_frame` (72) per
+record, in the host's byte order.
 Records keep their borders and their order, and a closed peer is noticed at once.
 """
 
@@ -11,10 +12,10 @@ from typing import NoReturn
 
 from drivers.buses.kernel_socket import SocketBus
 from drivers.errors import BusError
-from drivers.frame import ERR_BIT, FLAGS_INDEX, FRAME_SIZE
+from drivers.frame import ERR_BIT, FD_FRAME_SIZE, FLAGS_INDEX, RECORD_SIZES
 
-RECORD_LIMIT = FRAME_SIZE + 1
-"""Bytes to ask for in one read: one more than a frame, so that a longer record shows."""
+RECORD_LIMIT = FD_FRAME_SIZE + 1
+"""Bytes to ask for in one read: one more than the longest frame, so that a longer record shows."""
 
 _QUEUE_BYTES = 4 << 20  # the kernel charges about 770 bytes for a record of 16
 _SO_SNDBUFFORCE = 32  # asm-generic/socket.h; not in Python's socket module
@@ -53,7 +54,7 @@ class UnixBus(SocketBus):
     def _take(self) -> bytes | None:
         try:
             record = self._receive(RECORD_LIMIT)
-            while len(record) != FRAME_SIZE:
+            while len(record) not in RECORD_SIZES:
                 self._drop(record)
                 record = self._receive(RECORD_LIMIT)
         except BlockingIOError:

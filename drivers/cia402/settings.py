@@ -4,7 +4,8 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from drivers.settings import AxisSettings
+from drivers.cia402 import codec
+from drivers.settings import ACYCLIC, AxisSettings, CycleFrame
 
 
 class Cia402Settings(AxisSettings):
@@ -40,3 +41,24 @@ class Cia402Settings(AxisSettings):
     def master_heartbeat_ms(self) -> int:
         """The master's heartbeat is as frequent as the drive's."""
         return self.heartbeat_ms
+
+    def identifiers(self) -> dict[int, str]:
+        """The predefined connection set in use (CiA 301, 7.3.5)."""
+        own = {codec.COB_EMCY: "EMCY", codec.COB_TPDO1: "TPDO1", codec.COB_RPDO1: "RPDO1",
+               codec.COB_SDO_TX: "SDO", codec.COB_SDO_RX: "SDO",
+               codec.COB_HEARTBEAT: "heartbeat"}  # fmt: skip
+        common = {codec.COB_NMT: "NMT", codec.COB_SYNC: "SYNC"}
+        return common | {cob_id + self.node_id: use for cob_id, use in own.items()}
+
+    def cycle_frames(self, period_s: float) -> tuple[CycleFrame, ...]:
+        """SYNC, RPDO1 and TPDO1; now and then a heartbeat each way, EMCY, one SDO frame."""
+        beat = max(2, round(self.heartbeat_ms * 1e-3 / period_s))
+        return (
+            CycleFrame("SYNC", 0, is_shared=True),
+            CycleFrame("RPDO1", 4),
+            CycleFrame("TPDO1", 8),
+            CycleFrame("heartbeat", 1, every=beat),
+            CycleFrame("EMCY", 8, every=ACYCLIC),
+            CycleFrame("master heartbeat", 1, every=beat, is_shared=True),
+            CycleFrame("SDO", 8, every=ACYCLIC, is_shared=True),
+        )

@@ -22,7 +22,11 @@ VERBS: Final = {
     "watch": "follow a running daemon",
     "report": "plots and figures from a recording",
     "export": "a recording as CSV",
+    "diff": "are two recordings the same run, and if not, where do they part",
+    "replay": "a recording once more through drivers and controller, compared frame by frame",
     "doctor": "check host, bus and configuration",
+    "conform": "drive one amplifier through its paces, pass or fail per step",
+    "bus": "monitor, log and play frames; DBC and EDS",
 }
 INTERRUPTED: Final = 130
 

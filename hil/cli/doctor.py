@@ -2,22 +2,47 @@
 
 import argparse
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 
+from hil.budget import budget_table, bus_budget
 from hil.cli.options import add_configuration, configuration
-from hil.doctor import examine
+from hil.config import Config
+from hil.doctor import Finding, check_bus_load, examine
+
+_BUDGET = ""
+"""Value of `--bus` without an address."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the verb's options."""
-    add_configuration(parser)
+    bus = add_configuration(parser)
+    bus.nargs, bus.const = "?", _BUDGET
+    bus.help = f"{bus.help}; without an address: only the bus budget, frame by frame"
     parser.add_argument("--json", action="store_true", help="machine-readable")
 
 
 def run(options: argparse.Namespace) -> int:
     """Print every finding; 1 if one failed."""
-    findings = examine(configuration(options))
-    if options.json:
+    is_budget_only = options.bus == _BUDGET
+    options.bus = options.bus or None
+    config = configuration(options)
+    if is_budget_only:
+        return _show_budget(config, is_json=options.json)
+    return _show(examine(config), is_json=options.json)
+
+
+def _show_budget(config: Config, *, is_json: bool) -> int:
+    budget = bus_budget(config)
+    if is_json:
+        print(json.dumps(budget.as_json(), indent=2))
+        return 0 if budget.is_fitting else 1
+    print(budget_table(budget))
+    return _show([check_bus_load(config)], is_json=False)
+
+
+def _show(findings: Sequence[Finding], *, is_json: bool) -> int:
+    if is_json:
         print(json.dumps([asdict(finding) for finding in findings], indent=2))
     else:
         for finding in findings:

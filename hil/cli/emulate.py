@@ -4,9 +4,8 @@ import argparse
 import signal
 
 from hil.cli.options import add_configuration, configuration
-from hil.emulation import build_emulator
+from hil.emulation import describe_load, open_emulation
 from hil.realtime import freeze_garbage, make_realtime
-from sim_backend.hub import open_wire
 from sim_backend.server import EmulatorServer
 
 BELOW_LOOP = 10
@@ -30,8 +29,8 @@ def run(options: argparse.Namespace) -> int:
     ended: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda signum, _: ended.append(signum))
-    with open_wire(config.bus.address) as wire:
-        emulator = build_emulator(config, wire.transmit, is_lockstep=settings.time == "lockstep")
+    wire, emulator = open_emulation(config, settings)
+    with wire:
         server = EmulatorServer(emulator, wire, settings)
         rights = config.loop.model_copy(
             update={
@@ -44,8 +43,10 @@ def run(options: argparse.Namespace) -> int:
         freeze_garbage()
         print(
             f"emulating {config.joints} amplifiers and arm {config.arm.preset} on "
-            f"{config.bus.address}, {settings.time}, {granted.scheduler}",
+            f"{wire.address or config.bus.address}, {settings.time}, {granted.scheduler}",
             flush=True,
         )
         server.run(lambda: bool(ended))
+        if load := describe_load(wire):
+            print(load, flush=True)
     return 0

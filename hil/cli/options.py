@@ -10,13 +10,19 @@ from hil.experiment import scenario_settings
 from hil.scenarios import find_scenario
 
 
-def add_configuration(parser: argparse.ArgumentParser) -> None:
-    """Add the options that select and change the configuration."""
+def add_configuration(parser: argparse.ArgumentParser) -> argparse.Action:
+    """Add the options that select and change the configuration; return `--bus`."""
     parser.add_argument("--config", metavar="FILE", help="TOML file (default: presets alone)")
     parser.add_argument("--scenario", metavar="NAME", help="reference scenario: A0, A, B or E")
-    parser.add_argument(
+    bus = parser.add_argument(
         "--bus", metavar="ADDRESS", help="unix:PATH, vcan0, socketcan:can0, python-can:KIND:CHANNEL"
     )
+    add_assignments(parser)
+    return bus
+
+
+def add_assignments(parser: argparse.ArgumentParser) -> None:
+    """Add the option that changes single settings."""
     parser.add_argument(
         "--set",
         action="append",
@@ -25,6 +31,18 @@ def add_configuration(parser: argparse.ArgumentParser) -> None:
         dest="assignments",
         help="change any setting; entries of a list by number: axes.1.node_id=5",
     )
+
+
+def assigned(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the single settings asked for, as nested tables.
+
+    Raises:
+        ConfigError: If one is no assignment.
+    """
+    over: dict[str, Any] = {}
+    for assignment in options.assignments:
+        over = merge(over, parse_assignment(assignment))
+    return over
 
 
 def configuration(options: argparse.Namespace) -> Config:
@@ -39,9 +57,7 @@ def configuration(options: argparse.Namespace) -> Config:
         over = scenario_settings(find_scenario(options.scenario))
     if options.bus is not None:
         over = merge(over, {"bus": {"address": options.bus}})
-    for assignment in options.assignments:
-        over = merge(over, parse_assignment(assignment))
-    return load_config(options.config, over)
+    return load_config(options.config, merge(over, assigned(options)))
 
 
 def add_connection(parser: argparse.ArgumentParser) -> None:

@@ -292,6 +292,22 @@ def test_self_tuning_gain__narrowed_and_widened__returns_to_the_same_surface(nar
     assert after == pytest.approx(before, abs=1e-9)
 
 
+def test_self_tuning_gain__configured_without_room_then_widened__has_the_surface_of_its_rules():
+    gain, wide = tuned(Kd_min=(2.0, 2.0), Kd_max=(2.0, 2.0)), tuned()
+    assert [gain.step(S, T) for S in (0.0, 0.3, 1.0)] == [2.0, 2.0, 2.0]
+    gain.set_bounds(1.0, 4.0)
+    for _ in range(300):
+        gain.step(0.3, T)
+    for S in (0.0, 0.2, 0.4, 0.7, 2.0):
+        assert gain.step(S, T) == pytest.approx(wide.step(S, T), abs=1e-12)
+
+
+def test_self_tuning_gain__equal_consequences_without_room_then_widened__stays_at_the_lower_bound():
+    gain = tuned(Kd_min=(2.0, 2.0), Kd_max=(2.0, 2.0), beta=(3.0, 3.0, 3.0))
+    gain.set_bounds(1.5, 4.0)
+    assert [gain.step(0.3, T) for _ in range(300)][-1] == pytest.approx(1.5, abs=1e-12)
+
+
 def test_self_tuning_gain__narrowed__the_surface_is_scaled_into_the_bounds():
     gain, before = tuned(), tuned()
     gain.set_bounds(2.0, 3.5)

@@ -115,6 +115,26 @@ def test_velocity__impossible_setting__refused(wrong):
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0])
+@pytest.mark.parametrize("name", ["alpha", "lambda_", "Kd"])
+def test_law__not_above_zero__refused_with_setting_and_joint(name, value):
+    """A negative gain drives the arm away from its reference."""
+    with pytest.raises(ValidationError, match=f"joint 2: {name} {value:g} must be above 0"):
+        LawSettings(**{name: (4.0, value)})
+
+
+def test_law__negative_Ki__refused_and_zero_accepted():
+    with pytest.raises(ValidationError, match=r"joint 1: Ki -0.2 must not be below 0"):
+        LawSettings(Ki=(-0.2, 0.2))
+    assert LawSettings(Ki=(0.0, 0.2)).Ki == (0.0, 0.2)
+
+
+@pytest.mark.parametrize("value", [0.0, -50.0])
+def test_velocity__C_not_above_zero__refused_with_the_joint(value):
+    with pytest.raises(ValidationError, match=f"joint 2: C_rad_s2 {value:g} must be above 0"):
+        VelocitySettings(C_rad_s2=(50.0, value))
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
 @pytest.mark.parametrize("name", POSITIVE)
 def test_limits__not_above_zero__refused_with_setting_and_joint(name, value):
     """A negative torque limit would turn "clip to +-tau_max" into a constant torque."""

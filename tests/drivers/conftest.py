@@ -7,7 +7,6 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
-from pathlib import Path
 
 import pytest
 
@@ -15,6 +14,7 @@ from drivers.bus import Bus, open_bus
 from drivers.buses.loopback import LoopbackBus
 from drivers.buses.unix import enlarge_send_queue
 from sim_backend.hub import UnixHub
+from sim_backend.slcan_wire import SlcanPty
 
 _numbers = count(1)
 
@@ -29,6 +29,8 @@ class Wiring:
     """Unread frames that certainly fit between two participants."""
     cut: Callable[[], None] | None = None
     """Take the wire away under its participants, where that can happen."""
+    report: Callable[[Bus, bytes], object] = lambda bus, frame: bus.send(frame)
+    """Have an error report arrive at everybody but this participant, after what it has sent."""
 
 
 class RunningHub:
@@ -52,6 +54,46 @@ class RunningHub:
         self.hub.close()
 
 
+class RunningAdapters:
+    """One emulated serial adapter for every participant, all on one wire, served by a thread."""
+
+    def __init__(self) -> None:
+        self._wires: list[SlcanPty] = []
+        self._reports: list[bytes] = []
+        self._is_stopped = threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def join(self) -> Bus:
+        """Plug in one more adapter, and open it."""
+        self._wires.append(SlcanPty())
+        return open_bus(self._wires[-1].address)
+
+    def report(self, _: Bus, frame: bytes) -> None:
+        """Have all adapters report an error before any frame sent from now on."""
+        self._reports.append(frame)
+
+    def _serve(self) -> None:
+        while not self._is_stopped.is_set():
+            for wire in tuple(self._wires):
+                frames = wire.wait(0.001)
+                while self._reports:
+                    self._relay(self._reports.pop(0), None)
+                for frame in frames:
+                    self._relay(frame, wire)
+
+    def _relay(self, frame: bytes, source: SlcanPty | None) -> None:
+        for wire in tuple(self._wires):
+            if wire is not source:
+                wire.transmit(frame)
+
+    def stop(self) -> None:
+        self._is_stopped.set()
+        self._thread.join()
+        for wire in self._wires:
+            wire.close()
+
+
 @pytest.fixture
 def socket_path() -> Iterator[str]:
     """A path short enough for a Unix socket (107 characters), which pytest's own is not always."""
@@ -66,38 +108,7 @@ def running_hub(socket_path: str) -> Iterator[RunningHub]:
     running.stop()
 
 
-@pytest.fixture
-def own_vcan() -> Iterator[str | None]:
-    """A virtual CAN interface of the test's own, or None where it may not make one.
-
-    Skips with the reason where the kernel has no CAN at all.
-    """
-    try:
-        socket.socket(29, socket.SOCK_RAW, 1).close()  # AF_CAN, CAN_RAW
-    except OSError as error:
-        pytest.skip(f"this kernel has no CAN (AF_CAN): {error.strerror}")
-    name = f"hil{next(_numbers)}"
-    adding = ["ip", "link", "add", "dev", name, "type", "vcan"]
-    if subprocess.run(adding, capture_output=True, check=False).returncode:
-        yield None
-        return
-    subprocess.run(["ip", "link", "set", name, "up"], check=True)
-    yield name
-    subprocess.run(["ip", "link", "delete", name], capture_output=True, check=False)
-
-
-@pytest.fixture
-def vcan(own_vcan: str | None) -> str:
-    """A virtual CAN interface that is up: the test's own, or the host's vcan0."""
-    if own_vcan:
-        return own_vcan
-    flags = Path("/sys/class/net/vcan0/flags")
-    if not flags.exists() or not int(flags.read_text(), 16) & 1:
-        pytest.skip("no interface vcan0 that is up, and not allowed to make one")
-    return "vcan0"
-
-
-@pytest.fixture(params=["unix", "loopback", "python-can", "socketcan"])
+@pytest.fixture(params=["unix", "loopback", "python-can", "slcan", "socketcan"])
 def wiring(request: pytest.FixtureRequest) -> Iterator[Wiring]:
     opened: list[Bus] = []
     made: Wiring = request.getfixturevalue(f"_wiring_{request.param.replace('-', '_')}")
@@ -138,6 +149,13 @@ def _wiring_loopback() -> Wiring:
 def _wiring_python_can() -> Wiring:
     address = f"python-can:virtual:contract-{next(_numbers)}"
     return Wiring(lambda: open_bus(address), 1_000_000)
+
+
+@pytest.fixture
+def _wiring_slcan() -> Iterator[Wiring]:
+    adapters = RunningAdapters()
+    yield Wiring(adapters.join, 500, cut=adapters.stop, report=adapters.report)
+    adapters.stop()
 
 
 @pytest.fixture

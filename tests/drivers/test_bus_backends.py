@@ -16,6 +16,7 @@ from pathlib import Path
 
 import can
 import pytest
+from can.interfaces.virtual import VirtualBus
 
 from drivers.bus import open_bus, split_address
 from drivers.buses.loopback import LoopbackBus
@@ -113,10 +114,10 @@ def test_unix__path_too_long__is_a_bus_error():
 def test_unix__records_of_wrong_size__are_dropped_and_counted(peer_and_bus):
     peer, bus = peer_and_bus
     frame = pack_frame(0x181, b"\x01")
-    for record in (b"", b"x", frame[:15], frame + b"x", bytes(72), frame):
+    for record in (b"", b"x", frame[:15], frame + b"x", bytes(71), bytes(73), frame):
         peer.send(record)
     assert bus.recv(WAIT_S) == frame
-    assert bus.stats.malformed_records == 5
+    assert bus.stats.malformed_records == 6
     assert bus.stats.frames_received == 1
 
 
@@ -225,6 +226,31 @@ def test_python_can__adapter_missing__is_a_bus_error():
         PythonCanBus("slcan:/dev/nosuch@1000000")
 
 
+def test_python_can__half_a_data_bit_rate__is_part_of_the_channel(channel):
+    with PythonCanBus(f"virtual:{channel}@1000000/") as bus, can.Bus(channel, "virtual") as raw:
+        bus.send(pack_frame(1))
+        assert raw.recv(0.0) is None
+
+
+def test_python_can__data_bit_rate_in_the_address__opens_the_adapter_for_can_fd(monkeypatch):
+    asked: list[dict[str, object]] = []
+
+    class Adapter(VirtualBus):
+        def __init__(self, channel: str, **options: object) -> None:
+            asked.append(options)
+            super().__init__(channel)
+
+    monkeypatch.setattr("can.interface._get_class_for_interface", lambda _: Adapter)
+    PythonCanBus("kvaser:0@1000000/5000000").close()
+    PythonCanBus("kvaser:0@1000000").close()
+    assert (asked[0]["bitrate"], asked[0]["data_bitrate"], asked[0]["fd"]) == (
+        1_000_000,
+        5_000_000,
+        True,
+    )
+    assert "fd" not in asked[1]
+
+
 def test_python_can__bit_rate_in_the_address__reaches_the_interface(channel):
     with PythonCanBus(f"virtual:{channel}@1000000") as bus, PythonCanBus(f"virtual:{channel}") as b:
         bus.send(pack_frame(1))
@@ -234,14 +260,17 @@ def test_python_can__bit_rate_in_the_address__reaches_the_interface(channel):
 @pytest.mark.parametrize(
     "message",
     [
-        can.Message(arbitration_id=1, is_extended_id=False, is_fd=True, data=bytes(8)),
+        can.Message(arbitration_id=1, is_fd=True, data=bytes(13)),
+        can.Message(arbitration_id=0x800, is_extended_id=False, is_fd=True),
+        can.Message(arbitration_id=1, is_fd=True, is_remote_frame=True),
+        can.Message(arbitration_id=1, is_fd=True, is_error_frame=True),
         can.Message(arbitration_id=1, is_extended_id=False, data=bytes(12)),
         can.Message(arbitration_id=0x800, is_extended_id=False),
         can.Message(arbitration_id=-1),
         can.Message(arbitration_id=1, dlc=9),
     ],
 )
-def test_python_can__no_classic_frame_received__is_dropped_and_counted(channel, message):
+def test_python_can__no_frame_received__is_dropped_and_counted(channel, message):
     with PythonCanBus(f"virtual:{channel}") as bus, can.Bus(channel, "virtual") as raw:
         raw.send(message)
         raw.send(can.Message(arbitration_id=5, is_extended_id=False))

@@ -1,3 +1,5 @@
+import sys
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,10 +10,16 @@ from drivers.frame import (
     EFF_MASK,
     ERR_BIT,
     ERR_FLAG,
+    FD_ESI,
+    FD_FRAME_SIZE,
+    FD_LENGTHS,
     FLAGS_INDEX,
     FRAME_SIZE,
     RTR_FLAG,
     SFF_MASK,
+    fd_length,
+    is_fd,
+    pack_fd_frame,
     pack_frame,
     unpack_frame,
     unpack_header,
@@ -29,6 +37,50 @@ def test_frame__packed_and_unpacked__is_the_same(can_id, data):
     assert unpack_frame(frame) == (can_id, data)
     assert unpack_header(frame) == (can_id, len(data))
     assert not frame[FLAGS_INDEX] & ERR_BIT
+
+
+@given(can_ids, st.sampled_from(FD_LENGTHS).flatmap(lambda n: st.binary(min_size=n, max_size=n)))
+def test_fd_frame__packed_and_unpacked__is_the_same(can_id, data):
+    frame = pack_fd_frame(can_id, data)
+    assert len(frame) == FD_FRAME_SIZE
+    assert is_fd(frame)
+    assert not is_fd(pack_frame(can_id))
+    assert unpack_frame(frame) == (can_id, data)
+    assert unpack_header(frame) == (can_id, len(data))
+    message = to_message(frame)
+    assert message.is_fd
+    assert message.bitrate_switch
+    assert not message.error_state_indicator
+    assert from_message(message) == frame
+
+
+def test_fd_frame__layout__is_the_kernels():
+    frame = pack_fd_frame(0x123, b"\x11\x22", flags=FD_ESI)
+    can_id = (0x123).to_bytes(4, sys.byteorder)
+    assert frame == can_id + b"\x02\x06\0\0\x11\x22" + bytes(62)
+
+
+@pytest.mark.parametrize("length", [9, 13, 33, 63, 65])
+def test_fd_frame__length_that_does_not_exist__is_refused(length):
+    with pytest.raises(ValueError, match=f"12, 16 ... 64 bytes, not {length}"):
+        pack_fd_frame(1, bytes(length))
+
+
+@pytest.mark.parametrize(("length", "room"), [(0, 0), (8, 8), (9, 12), (25, 32), (64, 64)])
+def test_fd_length__any_length__is_the_next_that_exists(length, room):
+    assert fd_length(length) == room
+
+
+def test_fd_length__too_long__is_refused():
+    with pytest.raises(ValueError, match="at most 64 bytes, not 65"):
+        fd_length(65)
+
+
+@given(st.binary(min_size=FD_FRAME_SIZE, max_size=FD_FRAME_SIZE))
+def test_fd_frame__any_record__unpacks_and_converts_without_raising(record):
+    can_id, data = unpack_frame(record)
+    assert (can_id, data) == (unpack_header(record)[0], record[8 : 8 + min(record[4], 64)])
+    assert to_message(record).is_fd
 
 
 def test_frame__layout__is_the_kernels():

@@ -50,6 +50,12 @@ PELICAN = Arm(
 ARMS = {"bench": BENCH, "pelican": PELICAN}
 
 
+def memberships(s: float) -> tuple[float, float, float]:
+    a = 1.0 / (1.0 + math.exp(min((0.20 - s) / 0.04, 700.0)))
+    b = 1.0 / (1.0 + math.exp(min((0.60 - s) / 0.12, 700.0)))
+    return b, max(a - b, 0.0), 1.0 - a
+
+
 @dataclass(frozen=True)
 class Law:
     """tau = -Kd S with the paper's gains; a wrong one is made with `replace`."""
@@ -59,6 +65,8 @@ class Law:
     Ki: float = 0.2
     beta: tuple[float, float, float] = (1.0, 2.0, 4.0)  # big, medium, small
     learning_rate: float = 1e-6
+    f: Callable[[float], float] = math.tanh
+    degrees: Callable[[float], tuple[float, float, float]] = memberships  # of big, medium, small
 
 
 def make_acceleration(arm: Arm, gravity_m_s2: float) -> Callable[..., tuple[float, float]]:
@@ -100,12 +108,6 @@ def rk4(f, state, torques, h):
         v1 + h / 6 * (a1 + 2 * b1 + 2 * c1 + d1),
         v2 + h / 6 * (a2 + 2 * b2 + 2 * c2 + d2),
     )
-
-
-def memberships(s: float) -> tuple[float, float, float]:
-    a = 1.0 / (1.0 + math.exp(min((0.20 - s) / 0.04, 700.0)))
-    b = 1.0 / (1.0 + math.exp(min((0.60 - s) / 0.12, 700.0)))
-    return b, max(a - b, 0.0), 1.0 - a
 
 
 class FilteredDifference:
@@ -164,12 +166,12 @@ class Controller:
         for j in (0, 1):
             S_q = dq[j] - dq_des[j] + law.alpha[j] * (q[j] - q_des[j])
             S = S_q + law.Ki * self.sigma[j]
-            big, medium, small = memberships(abs(S))
+            big, medium, small = law.degrees(abs(S))
             beta = self.beta[j]
             Kd = min(max(beta[0] * big + beta[1] * medium + beta[2] * small, 1.0), 4.0)
             sent = min(max(-Kd * S, -self.tau_max[j]), self.tau_max[j])
             if sent == -Kd * S or S_q * S < 0:
-                self.sigma[j] += PERIOD_S * math.tanh(law.lambda_ * S_q)
+                self.sigma[j] += PERIOD_S * law.f(law.lambda_ * S_q)
             if self.rate:
                 step = self.rate * S * law.alpha[j]
                 moved = (beta[0] - step * big, beta[1] - step * medium, beta[2] - step * small)

@@ -146,8 +146,8 @@ class SeenFrame:
 class BusWatcher:
     """A node of its own on the bus, through python-can: hears all, reads a drive's objects."""
 
-    def __init__(self, path):
-        self._bus = can.Bus(interface="hil-unix", channel=str(path))
+    def __init__(self, bus):
+        self._bus = bus
         self.frames = deque(maxlen=200_000)
         self._is_ended = False
         self._thread = threading.Thread(target=self._listen)
@@ -157,7 +157,7 @@ class BusWatcher:
         while not self._is_ended:
             try:
                 message = self._bus.recv(0.05)
-            except can.CanOperationError:  # the emulator has gone
+            except can.CanError:  # the emulator has gone
                 return
             if message is not None:
                 seen = SeenFrame(time.monotonic(), message.arbitration_id, bytes(message.data))
@@ -308,6 +308,7 @@ class Lab:
     def __init__(self, directory):
         self.directory = Path(directory)
         self.bus_path = self.directory / "bus"
+        self.bus = f"unix:{self.bus_path}"
         self.arm = "lab"
         self.port = free_port()
         self.endpoint = f"tcp/127.0.0.1:{self.port}"
@@ -322,7 +323,7 @@ class Lab:
 
     def settings(self, *assignments):
         """Options of both emulator and daemon: this bus, and rights where the host gives them."""
-        options = ["--bus", f"unix:{self.bus_path}"]
+        options = ["--bus", self.bus]
         for assignment in ("loop.realtime=best_effort", *assignments):
             options += ["--set", assignment]
         return options
@@ -350,8 +351,12 @@ class Lab:
         self._stack.callback(client.close)
         return client
 
+    def join_bus(self):
+        """A python-can participant of its own."""
+        return can.Bus(interface="hil-unix", channel=str(self.bus_path))
+
     def watch_bus(self):
-        watcher = BusWatcher(self.bus_path)
+        watcher = BusWatcher(self.join_bus())
         self._stack.callback(watcher.close)
         return watcher
 

@@ -267,15 +267,27 @@ def records(least, most):
     )
 
 
-@given(st.lists(records(16, 16), max_size=5))
+RECORDS = records(16, 16) | records(72, 72)
+"""Of classic and of CAN FD frames."""
+
+
+@given(st.lists(records(16, 16), max_size=5) | st.lists(RECORDS, max_size=5))
 def test_bus_frame_layout__any_frames__generated_class_and_decoder_agree(logged):
     layout = BusFrameLayout()
     entries = [layout.entry(*frame) for frame in logged]
-    assert all(len(entry) == layout.size for entry in entries)
+    sizes = {16: layout.size, 72: layout.fd_size}
+    assert [len(entry) for entry in entries] == [sizes[len(frame)] for *_, frame in logged]
     log = b"".join(entries)
     message = telemetry_pb2.BusLog.FromString(log)
     assert [(f.t_ns, f.direction, f.frame) for f in message.frames] == logged
     assert layout.decode_log(log) == [LoggedFrame(*frame) for frame in logged]
+
+
+@given(st.lists(RECORDS, min_size=1, max_size=5))
+def test_first_t_ns__log_of_either_size__that_of_the_first_frame(logged):
+    layout = BusFrameLayout()
+    log = b"".join(layout.entry(*frame) for frame in logged)
+    assert layout.first_t_ns(log) == logged[0][0]
 
 
 @given(st.lists(records(0, 72), max_size=5))
@@ -291,12 +303,6 @@ def test_decode_log__log_of_the_generated_class__same_frames(logged):
 def test_decode_log__any_bytes__frames_or_telemetry_error(payload):
     with suppress(TelemetryError):
         assert all(isinstance(f, LoggedFrame) for f in BusFrameLayout().decode_log(payload))
-
-
-def test_bus_frame_layout__can_fd_record__constant_size():
-    layout = BusFrameLayout(72)
-    log = layout.entry(5, SENT, bytes(range(72)))
-    assert layout.decode_log(log) == [LoggedFrame(5, SENT, bytes(range(72)))]
 
 
 def test_writer__nan_and_infinities__kept():

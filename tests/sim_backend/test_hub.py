@@ -12,7 +12,7 @@ from drivers.bus import open_bus
 from drivers.buses.loopback import LoopbackBus
 from drivers.buses.unix import UnixBus
 from drivers.errors import BusError
-from drivers.frame import pack_frame, unpack_frame
+from drivers.frame import EFF_FLAG, pack_fd_frame, pack_frame, unpack_frame
 from sim_backend.errors import SimError
 from sim_backend.hub import BusWire, UnixHub, open_wire
 
@@ -127,10 +127,13 @@ def test_hub__client_does_not_read__loses_frames_and_holds_up_nobody(hub, path):
     assert hub.frames_lost == 1, "the count outlives the client"
 
 
-@pytest.mark.parametrize("record", [b"", b"x", bytes(15), bytes(17), bytes(72), bytes(5000)])
-def test_hub__record_of_wrong_size__is_dropped_and_counted(hub, path, record):
+WRONG_SIZES = (0, 1, 15, 17, 71, 73, 5000)
+
+
+@pytest.mark.parametrize("size", WRONG_SIZES)
+def test_hub__record_of_wrong_size__is_dropped_and_counted(hub, path, size):
     with UnixBus(path) as client, UnixBus(path) as other:
-        client._socket.send(record)
+        client._socket.send(bytes(size))
         client.send(QUESTION)
         assert collect(hub, 1) == [QUESTION]
         assert [stats.malformed_records for stats in hub.clients] == [1, 0]
@@ -148,6 +151,17 @@ def test_hub__client_leaves__others_go_on(hub, path):
         assert len(hub.clients) == 1
         hub.transmit(ANSWER)
         assert stayer.recv(0.0) == ANSWER
+
+
+def test_hub__can_fd_record__is_relayed_whole_like_any_other(hub, path):
+    frame = pack_fd_frame(0x8001 | EFF_FLAG, bytes(range(64)))
+    with UnixBus(path) as client, UnixBus(path) as other:
+        client.send(QUESTION)
+        client.send(frame)
+        assert collect(hub, 2) == [QUESTION, frame]
+        hub.transmit(frame)
+        assert [other.recv(WAIT_S) for _ in range(3)] == [QUESTION, frame, frame]
+        assert client.recv(WAIT_S) == frame
 
 
 def test_hub__client_leaves_with_frames_unread__its_last_frames_still_count(hub, path):

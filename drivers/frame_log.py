@@ -1,0 +1,116 @@
+"""Frames in files, in python-can's formats: candump `.log`, Vector `.asc` and `.blf`."""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import can
+from can.io.generic import MessageWriter
+
+from drivers.buses.python_can import from_message, to_message
+from drivers.errors import DriverError
+
+SUFFIXES = (".log", ".asc", ".blf")
+_BROKEN = (
+    ValueError, LookupError, TypeError, AttributeError, EOFError, OverflowError,
+    struct.error, zlib.error, can.CanError, can.io.blf.BLFParseError,
+)  # fmt: skip
+"""What python-can's readers raise for a file that is not of its format."""
+
+
+class FrameLogError(DriverError):
+    """A log cannot be written or read; the message names the file and the reason."""
+
+
+def require_suffix(path: Path) -> None:
+    """Refuse a file name that names no format.
+
+    Raises:
+        FrameLogError: With the suffixes that do.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise FrameLogError(
+            f"{path}: the suffix chooses the format: .log (candump), .asc (Vector ASC) or .blf"
+        )
+
+
+class FrameLogWriter:
+    """Writes frames to a file; the suffix chooses the format. Use it in a `with` block.
+
+    Args:
+        path: Ends in .log, .asc or .blf.
+        channel: Name of the bus in the file, without spaces.
+
+    Raises:
+        FrameLogError: If the suffix is another one, or the file cannot be written.
+    """
+
+    def __init__(self, path: Path, channel: str = "can0") -> None:
+        require_suffix(path)
+        self.path = path
+        self.frames = 0
+        self._channel = channel
+        try:
+            self._writer: MessageWriter = can.Logger(path)
+        except OSError as error:
+            raise FrameLogError(f"{path}: {error.strerror or error}") from error
+
+    def write(self, frame: bytes, t_s: float, *, is_sent: bool = False) -> None:
+        """Append one frame.
+
+        Args:
+            frame: Record as on a bus.
+            t_s: Seconds since the epoch.
+            is_sent: It went out from here, where the format has a place for that.
+
+        Raises:
+            FrameLogError: If the file cannot be written to.
+        """
+        message = to_message(frame, timestamp_s=t_s, channel=self._channel)
+        message.is_rx = not is_sent
+        try:
+            self._writer.on_message_received(message)
+        except OSError as error:
+            raise FrameLogError(f"{self.path}: {error.strerror or error}") from error
+        self.frames += 1
+
+    def close(self) -> None:
+        """Write what is buffered and close the file. Idempotent."""
+        with suppress(ValueError):  # closed already
+            self._writer.stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def read_log(path: Path) -> Iterator[tuple[float, bytes]]:
+    """Yield (seconds, record) of every frame in a log, in the file's order.
+
+    Error reports are records with `ERR_FLAG`; what the records cannot hold is left out.
+
+    Raises:
+        FrameLogError: If there is no such file, or it is not what its suffix says.
+    """
+    require_suffix(path)
+    try:
+        with can.LogReader(path) as reader:
+            for message in reader:
+                frame = from_message(message)
+                if frame is not None:
+                    yield message.timestamp, frame
+    except OSError as error:
+        raise FrameLogError(f"{path}: {error.strerror or error}") from error
+    except _BROKEN as error:
+        raise FrameLogError(f"{path}: not a {path.suffix} log: {error}") from error

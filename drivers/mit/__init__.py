@@ -1,0 +1,1 @@
+"""MIT-mode joint motors: Damiao, T-Motor/CubeMars (mini-cheetah), CyberGear, RobStride."""

@@ -1,0 +1,1 @@
+"""ODrive amplifiers over CANSimple."""

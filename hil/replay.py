@@ -1,0 +1,284 @@
+"""Replays a recording: its frames and commands once more through drivers and controller.
+
+What was received is received again in the same cycle, what came from outside of the bus (commands,
+emergency stop, lost processes) is carried out in the same cycle, and every frame that the drivers
+send is compared with the recorded one, byte for byte; so is every sample, timing and plant aside.
+Nothing else decides what the controller does, so that any difference comes from the program or the
+configuration.
+"""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from controller.machine import Trigger
+from drivers.arm_bus import ArmBus
+from drivers.bus import Bus
+from drivers.errors import DriverError
+from drivers.registry import heartbeat_cycles, make_axes
+from hil.config import Config
+from hil.control import Control
+from hil.errors import HilError
+from hil.executor import Executor
+from hil.fixed_protobuf import Records
+from hil.recording import RecordedEvent, Recording
+from hil.sampler import Sampler, Stamps
+from hil.telemetry import SENT, LoggedFrame, SampleLayout
+
+TIMING: Final = frozenset(
+    {"seq", "t_ns", "overruns", "wake_late_ns", "feedback_ns", "law_ns", "sent_ns", "busy_ns"}
+)
+"""Columns of a sample that say when, not what."""
+
+
+class ReplayError(HilError):
+    """A recording lacks what a replay needs."""
+
+
+class Difference(NamedTuple):
+    """Where a replay first departs from the recording."""
+
+    cycle: int
+    what: str
+    recorded: str
+    replayed: str
+
+    def text(self) -> str:
+        """Return it in one line."""
+        when = "at start-up" if self.cycle < 0 else f"in cycle {self.cycle}"
+        return f"{when}: {self.what}: {self.recorded} against {self.replayed}"
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """Outcome of a replay.
+
+    Attributes:
+        cycles: Replayed.
+        frames_sent: Recorded as sent, as far as the replay went.
+        frames_equal: Of these, sent again byte for byte.
+        difference: The first one, in a frame or a sample; None if there is none.
+    """
+
+    cycles: int
+    frames_sent: int
+    frames_equal: int
+    difference: Difference | None
+
+
+class _FramesOverError(Exception):
+    """The recording has no more frames: it ends here."""
+
+
+class _DivergedError(Exception):
+    """The replay sends where the recording receives: nothing can be compared any more."""
+
+
+class _RecordedBus(Bus):
+    """A bus on which a recording happens again.
+
+    Attributes:
+        until_ns: Recorded instant up to which received frames belong to the present cycle; None
+            during start-up, when the time-outs decide.
+        clock_ns: Recorded time.
+    """
+
+    carries_fd = True
+
+    def __init__(self, frames: Iterable[LoggedFrame]) -> None:
+        super().__init__()
+        self._frames = iter(frames)
+        self._next = next(self._frames, None)
+        self.clock_ns = self._next.t_ns if self._next is not None else 0
+        self.until_ns: int | None = None
+        self.cycle = -1
+        self.sent = self.equal = 0
+        self.difference: Difference | None = None
+
+    def send(self, frame: bytes) -> bool:
+        recorded = self._next
+        if recorded is None:
+            raise _FramesOverError
+        if recorded.direction != SENT:
+            self.note("a frame sent", "none", frame.hex())
+            raise _DivergedError
+        self._advance(recorded)
+        self.sent += 1
+        if recorded.frame == frame:
+            self.equal += 1
+        else:
+            self.note(f"frame {self.sent}", recorded.frame.hex(), frame.hex())
+        return True
+
+    def recv(self, timeout_s: float) -> bytes | None:
+        until_ns = self.until_ns
+        if until_ns is None:
+            until_ns = self.clock_ns + round(timeout_s * 1e9)
+        frame = self._next
+        if frame is None or frame.direction == SENT or frame.t_ns > until_ns:
+            if self.until_ns is None:
+                self.clock_ns = until_ns
+            return None
+        self._advance(frame)
+        return frame.frame
+
+    def end_cycle(self, next_ns: int) -> None:
+        """Note a frame that the recording sent before the next cycle, and the replay did not."""
+        recorded = self._next
+        if recorded is not None and recorded.direction == SENT and recorded.t_ns < next_ns:
+            self.note("a frame sent", recorded.frame.hex(), "none")
+            raise _DivergedError
+
+    def note(self, what: str, recorded: str, replayed: str) -> None:
+        """Keep a difference if it is the first."""
+        if self.difference is None:
+            self.difference = Difference(self.cycle, what, recorded, replayed)
+
+    def _advance(self, frame: LoggedFrame) -> None:
+        self.clock_ns = max(self.clock_ns, frame.t_ns)
+        self._next = next(self._frames, None)
+
+    def fileno(self) -> int:
+        return -1
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class Replayer:
+    """Replays one recording.
+
+    Args:
+        recording: With frames; a run of the ideal arm (scenario A0) has none.
+        config: The configuration of the run; another one shows what it would have changed.
+
+    Raises:
+        ReplayError: If the recording has no frames or no samples.
+    """
+
+    def __init__(self, recording: Recording, config: Config) -> None:
+        if not len(recording.samples) or next(iter(recording.frames()), None) is None:
+            raise ReplayError(f"{recording.path} holds no cycles with bus frames to replay")
+        self._recording = recording
+        self._config = config
+        self._trajectories = recording.trajectories()
+        self._slots: dict[int, memoryview[float]] = {}
+        self._bus = _RecordedBus(recording.frames())
+        self._inputs = _inputs_by_cycle(recording.events)
+        self._layout = SampleLayout(config.joints, with_truth=False)
+        self._replayed: list[bytes] = []
+
+    def run(self) -> Replay:
+        """Replay the whole recording, or up to where nothing can be compared any more.
+
+        Raises:
+            ReplayError: If a reference that was played is not in the recording.
+        """
+        try:
+            self._start()
+            self._run_cycles()
+        except DriverError as error:
+            self._bus.note("start-up", "amplifiers configured", str(error))
+        except (_FramesOverError, _DivergedError):
+            pass
+        bus = self._bus
+        found = [d for d in (bus.difference, self._sample_difference()) if d is not None]
+        first = min(found, key=lambda difference: difference.cycle, default=None)
+        return Replay(len(self._replayed), bus.sent, bus.equal, first)
+
+    def _start(self) -> None:
+        config, bus = self._config, self._bus
+        period_s = config.loop.period_s
+        axes = make_axes(config.axes, period_s=period_s)
+        self._arm = ArmBus(bus, axes, now_ns=lambda: bus.clock_ns)
+        cycles = heartbeat_cycles(config.axes, period_s=period_s)
+        self._is_lockstep = self._arm.configure(heartbeat_cycles=cycles)[0].is_lockstep
+        self._control = Control(
+            config, self._arm, now_ns=lambda: bus.clock_ns, events=lambda *_: None
+        )
+        self._executor = Executor(self._control, self._slots.__getitem__, lambda *_: None)
+        self._sampler = Sampler(self._layout, self._control, self._arm)
+        self._control.fire(Trigger.BUS_READY)
+
+    def _run_cycles(self) -> None:
+        bus, columns = self._bus, self._recording.samples
+        before = -1
+        starts_ns = columns["t_ns"].tolist()
+        rows = zip(
+            columns["cycle"].tolist(),
+            starts_ns,
+            columns["feedback_ns"].tolist(),
+            [*starts_ns[1:], 0],
+            strict=True,
+        )
+        for cycle, start_ns, feedback_ns, next_ns in rows:
+            bus.cycle = cycle
+            bus.until_ns = start_ns + feedback_ns
+            self._take_inputs(cycle, is_after_step=False)
+            periods = 1 if self._is_lockstep else cycle - before
+            self._executor.begin_cycle(periods)
+            self._control.step(bus.until_ns, periods)
+            buffer = bytearray(self._layout.size)
+            self._sampler.write(buffer, 0, (cycle, start_ns, 0), Stamps())
+            self._replayed.append(bytes(buffer))
+            self._take_inputs(cycle, is_after_step=True)
+            bus.end_cycle(next_ns)
+            before = cycle
+
+    def _take_inputs(self, cycle: int, *, is_after_step: bool) -> None:
+        for command in self._inputs.get((cycle, is_after_step), ()):
+            if command["verb"] == "trajectory":
+                rows = self._trajectories.get(command["crc32"])
+                if rows is None:
+                    raise ReplayError(
+                        f"{self._recording.path} lacks the reference that began in cycle {cycle}"
+                    )
+                self._slots[command["slot"]] = memoryview(rows).cast("d")
+            self._executor.execute(command)
+
+    def _sample_difference(self) -> Difference | None:
+        if not self._replayed:
+            return None
+        replayed = self._layout.decode(self._replayed)
+        return first_difference(self._recording.samples[: len(replayed)], replayed)
+
+
+def _inputs_by_cycle(
+    events: Sequence[RecordedEvent],
+) -> dict[tuple[int, bool], list[Mapping[str, Any]]]:
+    inputs: dict[tuple[int, bool], list[Mapping[str, Any]]] = {}
+    for event in events:
+        if event.kind == "input":
+            place = (event.cycle, bool(event.detail["is_after_step"]))
+            inputs.setdefault(place, []).append(event.detail["command"])
+    return inputs
+
+
+def first_difference(
+    a: Records, b: Records, *, ignored: frozenset[str] = TIMING
+) -> Difference | None:
+    """Return the first cycle in which two runs' samples differ, and the first field there.
+
+    Args:
+        a: One run's samples, called recorded.
+        b: The other's, as many.
+        ignored: Columns that are not looked at; nor are those that only one of them has.
+    """
+    first: tuple[int, str] | None = None
+    for name in a.dtype.names or ():
+        if name in ignored or name not in (b.dtype.names or ()):
+            continue
+        unequal = (a[name] != b[name]) & ((a[name] == a[name]) | (b[name] == b[name]))  # not NaN
+        if unequal.ndim > 1:
+            unequal = unequal.any(axis=1)
+        rows = np.flatnonzero(unequal)
+        if len(rows) and (first is None or rows[0] < first[0]):
+            first = int(rows[0]), name
+    if first is None:
+        return None
+    row, name = first
+    pair = (json.dumps(columns[name][row].tolist()) for columns in (a, b))
+    return Difference(int(a["cycle"][row]), name, *pair)

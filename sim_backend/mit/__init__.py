@@ -1,0 +1,1 @@
+"""The emulated MIT-mode motors: Damiao, T-Motor, CubeMars, CyberGear, RobStride."""

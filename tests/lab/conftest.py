@@ -1,0 +1,88 @@
+"""Emulators and daemons on the CAN of a real kernel, beside foreign tools (can-utils)."""
+
+import os
+import subprocess
+from itertools import count
+from pathlib import Path
+
+import can
+import pytest
+
+from tests.hil.lab import Lab, wait_until
+
+_numbers = count(1)
+FAIR = "loop.realtime=off"
+"""The lab's kernel has one processor: two real-time processes would starve the others."""
+
+
+def ip(*words):
+    subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
+
+
+class CanLab(Lab):
+    """A lab whose bus is a CAN interface.
+
+    Attributes:
+        interface: The bus of emulator and daemons.
+    """
+
+    def __init__(self, directory, interface):
+        super().__init__(directory)
+        self.bus = self.interface = interface
+
+    def settings(self, *assignments):
+        return super().settings(FAIR, *assignments)
+
+    def join_bus(self):
+        return can.Bus(interface="socketcan", channel=self.interface)
+
+    def tool(self, *command):
+        """Start a program of can-utils; its output goes to a file."""
+        return self.enter(Tool(self.directory / f"tool{next(_numbers)}", command))
+
+    def enter(self, context):
+        return self._stack.enter_context(context)
+
+
+class Tool:
+    """A foreign program, its output read from a file while it runs."""
+
+    def __init__(self, path, command):
+        self._path = Path(path)
+        with self._path.open("w") as output:
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=os.environ | {"LC_ALL": "C"},
+            )
+
+    @property
+    def text(self):
+        return self._path.read_text()
+
+    def wait_for(self, words, timeout_s=20.0):
+        def is_there():
+            has_them = words in self.text
+            assert has_them or self.process.poll() is None, f"ended with {self.text!r}"
+            return has_them
+
+        wait_until(is_there, timeout_s, f"{words!r} from {self.process.args[0]}")
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.terminate()
+        self.process.wait(10)
+
+
+@pytest.fixture
+def can_lab(own_vcan, tmp_path):
+    """A lab on a vcan interface of its own."""
+    if own_vcan is None:
+        pytest.skip("not allowed to make a vcan interface")
+    place = CanLab(tmp_path, own_vcan)
+    yield place
+    place.close()
