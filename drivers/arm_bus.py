@@ -18,6 +18,9 @@ from drivers.frame import (
 SYNC_ID = 0x080
 HEARTBEAT_ID = 0x700
 RECEIVED, SENT = 0, 1
+MARK = 255
+"""In the frame log of a bus without SYNC: what follows was received in the cycle, not before it."""
+NO_FRAME = bytes(16)
 OVERDUE_FRAMES = 100
 """Queued frames still looked at when the time to wait for one is up."""
 FLOOD_FRAMES = 4096
@@ -25,7 +28,7 @@ FLOOD_FRAMES = 4096
 is flooded, and what is still queued is too old to be used."""
 
 FrameLog = Callable[[int, bytes], None]
-"""Called with (RECEIVED or SENT, record) for every frame, in the order seen."""
+"""Called with (RECEIVED or SENT, record) for every frame, in the order seen, and with MARK."""
 
 
 class ArmBus:
@@ -119,6 +122,8 @@ class ArmBus:
                 self._send(request)
         if self._sync is not None:
             self._send(self._sync)
+        elif self._log is not None:
+            self._log(MARK, NO_FRAME)
 
     def collect(self, deadline_ns: int) -> bool:
         """Receive until every axis has fresh feedback, or until the deadline.

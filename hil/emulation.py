@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from drivers.bus import split_address
 from drivers.cia402.settings import Cia402Settings
 from drivers.mit.settings import MitSettings
+from drivers.moteus.settings import MoteusSettings
 from drivers.odrive.endpoints import EMULATED, load_endpoints
 from drivers.odrive.settings import OdriveSettings
 from hil.config import Config
@@ -15,6 +16,7 @@ from sim_backend.errors import SimError
 from sim_backend.hub import Wire, open_wire
 from sim_backend.mit.node import make_node
 from sim_backend.mit.settings import MitNodeSettings
+from sim_backend.moteus.node import MoteusNode, MoteusNodeSettings
 from sim_backend.node import AmplifierNode, Transmit
 from sim_backend.odrive.node import OdriveNode, OdriveNodeSettings
 from sim_backend.servo import Servo
@@ -144,9 +146,17 @@ def _odrive(
     return OdriveNode(node_id, servo, transmit, settings, table=table, is_lockstep=is_lockstep)
 
 
+def _moteus(
+    axis: MoteusSettings, servo: Servo, transmit: Transmit, *, is_lockstep: bool
+) -> AmplifierNode:
+    settings = MoteusNodeSettings(can_prefix=axis.can_prefix, serial=axis.node_id)
+    return MoteusNode(axis.node_id, servo, transmit, settings, is_lockstep=is_lockstep)
+
+
 _NODES: dict[str, Callable[..., AmplifierNode]] = {
     "cia402": _cia402,
     "mit": _mit,
+    "moteus": _moteus,
     "odrive": _odrive,
 }
 """Family -> what emulates one of its axes."""

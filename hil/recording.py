@@ -27,6 +27,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, Writer
 from zstandard import ZstdError
 
+from drivers.arm_bus import MARK
 from hil.errors import HilError
 from hil.fixed_protobuf import Records
 from hil.proto import telemetry_pb2
@@ -261,8 +262,11 @@ class Recording:
             is_truncated=reader.is_truncated,
         )
 
-    def frames(self) -> Iterator[LoggedFrame]:
+    def frames(self, *, with_marks: bool = False) -> Iterator[LoggedFrame]:
         """Read the bus frames from the file, in the order in which the loop saw them.
+
+        Args:
+            with_marks: Also where cycles begin on a bus without SYNC (`drivers.arm_bus.MARK`).
 
         Raises:
             RecordingError: If the file is gone, or a bus log in it cannot be read.
@@ -272,10 +276,11 @@ class Recording:
             for topic, payload in _Reader(self.path, file):
                 if topic == "bus":
                     try:
-                        yield from layout.decode_log(payload)
+                        for frame in layout.decode_log(payload):
+                            if with_marks or frame.direction != MARK:
+                                yield frame
                     except TelemetryError as error:
                         raise RecordingError(f"recording {self.path}: {error}") from error
-
 
     def trajectories(self) -> dict[int, bytes]:
         """Read the references that were played: CRC-32 -> rows (`RecordingWriter.add_trajectory`).

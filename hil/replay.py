@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from controller.machine import Trigger
-from drivers.arm_bus import ArmBus
+from drivers.arm_bus import MARK, RECEIVED, SENT, ArmBus
 from drivers.bus import Bus
 from drivers.errors import DriverError
 from drivers.registry import heartbeat_cycles, make_axes
@@ -26,7 +26,7 @@ from hil.executor import Executor
 from hil.fixed_protobuf import Records
 from hil.recording import RecordedEvent, Recording
 from hil.sampler import Sampler, Stamps
-from hil.telemetry import SENT, LoggedFrame, SampleLayout
+from hil.telemetry import LoggedFrame, SampleLayout
 
 TIMING: Final = frozenset(
     {"seq", "t_ns", "overruns", "wake_late_ns", "feedback_ns", "law_ns", "sent_ns", "busy_ns"}
@@ -118,12 +118,17 @@ class _RecordedBus(Bus):
         if until_ns is None:
             until_ns = self.clock_ns + round(timeout_s * 1e9)
         frame = self._next
-        if frame is None or frame.direction == SENT or frame.t_ns > until_ns:
+        if frame is None or frame.direction != RECEIVED or frame.t_ns > until_ns:
             if self.until_ns is None:
                 self.clock_ns = until_ns
             return None
         self._advance(frame)
         return frame.frame
+
+    def pass_mark(self, direction: int, _frame: bytes) -> None:
+        """Frame log of the replayed bus: its cycle has begun, and so has the recorded one."""
+        if direction == MARK and self._next is not None and self._next.direction == MARK:
+            self._advance(self._next)
 
     def end_cycle(self, next_ns: int) -> None:
         """Note a frame that the recording sent before the next cycle, and the replay did not."""
@@ -166,7 +171,7 @@ class Replayer:
         self._config = config
         self._trajectories = recording.trajectories()
         self._slots: dict[int, memoryview[float]] = {}
-        self._bus = _RecordedBus(recording.frames())
+        self._bus = _RecordedBus(recording.frames(with_marks=True))
         self._inputs = _inputs_by_cycle(recording.events)
         self._layout = SampleLayout(config.joints, with_truth=False)
         self._replayed: list[bytes] = []
@@ -201,6 +206,7 @@ class Replayer:
         )
         self._executor = Executor(self._control, self._slots.__getitem__, lambda *_: None)
         self._sampler = Sampler(self._layout, self._control, self._arm)
+        self._arm.log_frames(bus.pass_mark)
         self._control.fire(Trigger.BUS_READY)
 
     def _run_cycles(self) -> None:

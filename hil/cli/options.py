@@ -15,7 +15,9 @@ def add_configuration(parser: argparse.ArgumentParser) -> argparse.Action:
     parser.add_argument("--config", metavar="FILE", help="TOML file (default: presets alone)")
     parser.add_argument("--scenario", metavar="NAME", help="reference scenario: A0, A, B or E")
     bus = parser.add_argument(
-        "--bus", metavar="ADDRESS", help="unix:PATH, vcan0, socketcan:can0, python-can:KIND:CHANNEL"
+        "--bus",
+        metavar="ADDRESS",
+        help="unix:PATH, vcan0, socketcan:can0, slcan:DEVICE, python-can:KIND:CHANNEL",
     )
     add_assignments(parser)
     return bus
