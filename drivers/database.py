@@ -217,7 +217,7 @@ class FrameDecoder:
             return f"controller error report {data.hex(' ')}"
         if can_id & RTR_FLAG:
             return "remote request"
-        return data.hex(" ").upper()
+        return data.hex(" ").upper() or "no data"
 
 
 def frame_label(frame: bytes) -> str:

@@ -2,19 +2,24 @@
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import can
-from can.io.generic import MessageWriter
+from can.io.generic import MessageReader, MessageWriter
 
 from drivers.buses.python_can import from_message, to_message
 from drivers.errors import DriverError
 
-SUFFIXES = (".log", ".asc", ".blf")
+_READERS: dict[str, tuple[str, Callable[..., MessageReader]]] = {  # suffix -> file mode, reader
+    ".log": ("r", can.CanutilsLogReader),
+    ".asc": ("r", can.ASCReader),
+    ".blf": ("rb", can.BLFReader),
+}
+SUFFIXES = tuple(_READERS)
 _BROKEN = (
     ValueError, LookupError, TypeError, AttributeError, EOFError, OverflowError,
     struct.error, zlib.error, can.CanError, can.io.blf.BLFParseError,
@@ -104,9 +109,10 @@ def read_log(path: Path) -> Iterator[tuple[float, bytes]]:
         FrameLogError: If there is no such file, or it is not what its suffix says.
     """
     require_suffix(path)
+    mode, reader = _READERS[path.suffix.lower()]
     try:
-        with can.LogReader(path) as reader:
-            for message in reader:
+        with path.open(mode) as file:  # a reader that fails leaves its own file open
+            for message in reader(file):
                 frame = from_message(message)
                 if frame is not None:
                     yield message.timestamp, frame

@@ -9,17 +9,19 @@ from pydantic import Field
 from drivers.axis import Axis
 from drivers.cia402.settings import Cia402Settings
 from drivers.mit.settings import MitSettings
+from drivers.moteus.settings import MoteusSettings
 from drivers.odrive.settings import OdriveSettings
 from drivers.settings import AxisSettings
 
 AnyAxisSettings = Annotated[
-    Cia402Settings | MitSettings | OdriveSettings, Field(discriminator="family")
+    Cia402Settings | MitSettings | MoteusSettings | OdriveSettings, Field(discriminator="family")
 ]
 """Settings of any family, told apart by `family`."""
 
 SETTINGS: dict[str, type[AxisSettings]] = {
     "cia402": Cia402Settings,
     "mit": MitSettings,
+    "moteus": MoteusSettings,
     "odrive": OdriveSettings,
 }
 """Family -> its settings."""
@@ -27,6 +29,7 @@ SETTINGS: dict[str, type[AxisSettings]] = {
 _MASTERS = {  # family -> "module:class" of its master side
     "cia402": "drivers.cia402.master:Cia402Axis",
     "mit": "drivers.mit.master:MitAxis",
+    "moteus": "drivers.moteus.master:MoteusAxis",
     "odrive": "drivers.odrive.master:OdriveAxis",
 }
 

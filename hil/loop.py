@@ -35,6 +35,8 @@ from hil.telemetry import LoggedFrame
 GATEWAY_TIMEOUT_NS = 2_000_000_000
 FAREWELL_CYCLES = 5
 """Cycles run after power went off, so that every amplifier has the last word."""
+FAREWELL_TIMEOUT_NS = 100_000_000
+"""Longest wait for feedback in these: a drive that is silent holds up nobody's end."""
 
 
 class Loop:
@@ -125,6 +127,7 @@ class Loop:
             start_ns += self._period_ns
             if self._executor.is_ending and not self._control.machine.state.is_powered:
                 farewell -= 1
+                self._timeout_ns = min(self._timeout_ns, FAREWELL_TIMEOUT_NS)
         self._look_after()
 
     def _run_cycle(self, start_ns: int, woke_ns: int, periods: int) -> None:

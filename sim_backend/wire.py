@@ -50,7 +50,6 @@ class WireModel:
 
     Attributes:
         now_ns: The instant up to which everything has happened.
-        total: Since the beginning.
         last: The last window that is over, None before the first is.
         peak_share: Largest share of a window in which the wire was busy.
         window_ns: Length of a window.
@@ -61,7 +60,6 @@ class WireModel:
         self, settings: WireSettings, deliver: Deliver, *, bit_rate: int, data_bit_rate: int
     ) -> None:
         self.now_ns = 0
-        self.total = WireLoad()
         self.last: WireLoad | None = None
         self.peak_share = 0.0
         self.window_ns = round(settings.window_s * 1e9)
@@ -79,7 +77,9 @@ class WireModel:
         self._current: _Entry | None = None
         self._is_disturbed = False
         self._start_ns = self._end_ns = self._free_ns = 0
+        self._before = WireLoad()
         self._window = WireLoad()
+        self._window_end_ns = self.window_ns
         self._has_counts = False
         self.set_bit_error_rate(settings.bit_error_rate)
 
@@ -157,18 +157,33 @@ class WireModel:
         self._finish(self._current)
         return True
 
+    @property
+    def total(self) -> WireLoad:
+        """What the wire did since the beginning."""
+        before, window = self._before, self._window
+        return WireLoad(
+            0,
+            before.busy_ns + window.busy_ns,
+            before.frames + window.frames,
+            before.errors + window.errors,
+            max(before.wait_max_ns, window.wait_max_ns),
+        )
+
     def share(self, load: WireLoad) -> float:
         """Return the share of a window in which the wire was busy."""
         return load.busy_ns / self.window_ns
 
     def _pass_to(self, now_ns: int) -> None:
-        self.now_ns = max(self.now_ns, now_ns)
-        while now_ns >= self._window.start_ns + self.window_ns:
+        if now_ns > self.now_ns:  # noqa: PLR1730 - for every frame
+            self.now_ns = now_ns
+        while now_ns >= self._window_end_ns:
             self._close_window()
 
     def _close_window(self) -> None:
         done = self.last = self._window
-        self._window = WireLoad(done.start_ns + self.window_ns)
+        self._before = self.total
+        self._window = WireLoad(self._window_end_ns)
+        self._window_end_ns += self.window_ns
         self.peak_share = max(self.peak_share, self.share(done))
         if self.on_window is not None:
             self.on_window(done)
@@ -177,42 +192,49 @@ class WireModel:
         return round(bits * self._bit_ns)
 
     def _next_start_ns(self) -> int:
-        ready_ns = min([max(entry[2], entry[3].suspended_until_ns) for entry in self._queue])
-        return max(self._free_ns, ready_ns)
+        """When the next frame starts; on a free bus, all that wait were sent just now."""
+        ready_ns = self._queue[0][2]
+        if self._has_counts:
+            ready_ns = min([max(entry[2], entry[3].suspended_until_ns) for entry in self._queue])
+        return ready_ns if ready_ns > self._free_ns else self._free_ns
 
     def _begin(self, start_ns: int) -> None:
         """Arbitrate among those that are ready now that the bus is free."""
-        current = min([e for e in self._queue if max(e[2], e[3].suspended_until_ns) <= start_ns])
+        queue = self._queue
+        if self._has_counts:
+            queue = [entry for entry in queue if entry[3].suspended_until_ns <= start_ns]
+        current = min(queue)
         self._queue.remove(current)
         self._current = current
         frame = current[4]
-        first, second = (frame_bits(frame), 0) if len(frame) == FRAME_SIZE else fd_frame_bits(frame)
-        duration_ns = round(first * self._bit_ns + second * self._data_bit_ns)
+        if len(frame) == FRAME_SIZE:
+            bits = frame_bits(frame)
+            duration_ns = round(bits * self._bit_ns)
+        else:
+            first, second = fd_frame_bits(frame)
+            bits = first + second
+            duration_ns = round(first * self._bit_ns + second * self._data_bit_ns)
         self._start_ns = start_ns
         self._free_ns = start_ns + duration_ns
         self._end_ns = self._free_ns - self._interframe_ns
         self._is_disturbed = False
         if self._log_intact or current[3].failures_left:
-            self._disturb(current[3], first + second, duration_ns)
+            self._disturb(current[3], bits, duration_ns)
         for node in self._off:
             self._count_silence(node)
 
     def _finish(self, current: _Entry) -> None:
         self._current = None
         _, _, ready_ns, node, frame = current
-        window, total = self._window, self.total
-        busy_ns = self._free_ns - self._start_ns
-        window.busy_ns += busy_ns
-        total.busy_ns += busy_ns
+        window = self._window
+        window.busy_ns += self._free_ns - self._start_ns
         if self._is_disturbed:
             self._fail(current)
             return
         window.frames += 1
-        total.frames += 1
         wait_ns = self._start_ns - ready_ns
-        if wait_ns > window.wait_max_ns:
+        if wait_ns > window.wait_max_ns:  # noqa: PLR1730 - for every frame
             window.wait_max_ns = wait_ns
-            total.wait_max_ns = max(total.wait_max_ns, wait_ns)
         if self._has_counts:
             self._forgive(node)
         self._deliver(frame, node)
@@ -239,7 +261,6 @@ class WireModel:
         """Everybody has seen an error frame: count, and let the sender try again."""
         sender = current[3]
         self._window.errors += 1
-        self.total.errors += 1
         self._has_counts = True
         if not sender.is_bus_off:
             self._queue.append(current)
@@ -255,7 +276,7 @@ class WireModel:
         for node in counting:
             if not node.is_bus_off:
                 node.count_success(is_sender=node is sender)
-        self._has_counts = bool(counting)
+        self._has_counts = any(node.tec or node.rec for node in counting)
         self._suspend(sender)
 
     def _suspend(self, sender: CanController) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 FOLDERS = {"drivers", "lab"}
 """Where `make lab` looks."""
-CAN_FIXTURES = frozenset({"own_vcan", "vcan", "slcan_interface"})
+CAN_FIXTURES = frozenset({"own_vcan", "shared_vcan", "vcan", "slcan_interface"})
 _numbers = count(1)
 OWN_NAMESPACE = pytest.StashKey[int]()
 
@@ -80,8 +80,7 @@ def pytest_terminal_summary(terminalreporter, config):
         )
 
 
-@pytest.fixture
-def own_vcan():
+def make_vcan():
     """A virtual CAN interface of the test's own, or None where it may not make one.
 
     Skips with the reason where the kernel has no CAN at all.
@@ -98,6 +97,12 @@ def own_vcan():
     subprocess.run(["ip", "link", "set", name, "up"], check=True)
     yield name
     subprocess.run(["ip", "link", "delete", name], capture_output=True, check=False)
+
+
+@pytest.fixture
+def own_vcan():
+    """An interface of the test's own; see `make_vcan`."""
+    yield from make_vcan()
 
 
 @pytest.fixture

@@ -149,7 +149,8 @@ def run_in_guest(command: list[str], writable: list[Path], timeout_s: float, mem
 
 def _write_orders(exchange: Path, command: list[str], writable: list[Path]) -> None:
     """Leave for guest.sh what it shall run: the same directory and environment as here."""
-    environment = [f"{key}={value}" for key, value in os.environ.items()]
+    kept = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    environment = [f"{key}={value}" for key, value in kept.items()]  # bytecode goes to the overlay
     line = shlex.join(["env", "-i", *environment, *command])
     script = f"cd {shlex.quote(str(Path.cwd()))} && exec {line}\n"
     (exchange / "command").write_text(script, "utf-8")

@@ -169,7 +169,7 @@ def to_code(value: float, span: float, codes: int) -> int:
         codes: The largest number: 65535 or 4095.
     """
     if -span < value < span:
-        return codes - int((span - value) * codes / (2.0 * span) + 0.5)
+        return codes - int(0.5 * codes * (1.0 - value / span) + 0.5)
     if value >= span:
         return codes
     return 0 if value <= -span else codes // 2

@@ -80,7 +80,7 @@ class MoteusAxis(Axis):
             + codec.pack_head(READ, Register.SERIAL_NUMBER_1, Resolution.INT32, 3),
         )
         model = int(identity.get(Register.MODEL_NUMBER, -1))
-        is_lockstep = model == HIL_MODEL_NUMBER and identity[Register.SERIAL_NUMBER_2] == 1
+        is_lockstep = model == HIL_MODEL_NUMBER and identity.get(Register.SERIAL_NUMBER_2) == 1
         self._check_watchdog(port)
         console = Console(port, (self._request_id, self._reply_id), self.label, s.reply_timeout_s)
         console.start()

@@ -77,10 +77,10 @@ class OdriveAxis(Axis):
         """Identify the drive, set limits, rates and watchdog and read them back."""
         s = self._settings
         service = OdriveService(port, s.node_id, self.label, s.reply_timeout_s)
-        service.refuse_other_master()
         beat = service.wait_until_booted(s.heartbeat_ms)
-        version = service.version()
         refuse_unless_idle(self.label, beat)
+        service.refuse_other_master()
+        version = service.version()
         serial = service.serial()
         is_lockstep = service.is_lockstep(serial)
         if s.parameters == "set":
@@ -91,9 +91,8 @@ class OdriveAxis(Axis):
         if beat.errors == AxisError.WATCHDOG_TIMER_EXPIRED:  # nobody commanded it: no fault
             service.clear_errors()
         resolution_rad = self._resolution_rad(service)
-        name = (
-            f"ODrive {shown(version.hardware)}, firmware {shown(version.firmware)}, {serial:012X}"
-        )
+        board, firmware = shown(version.hardware), shown(version.firmware)
+        name = f"ODrive {board}, firmware {firmware}, serial {serial:012X}"
         torque_step_Nm = codec.f32_spacing(self._torque_max_motor_Nm) * s.gear_ratio
         return AxisInfo(name, torque_step_Nm, resolution_rad, is_lockstep)
 

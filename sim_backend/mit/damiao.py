@@ -3,7 +3,7 @@
 import math
 
 from drivers.mit import codec
-from drivers.mit.codec import DamiaoStatus, Feedback, Register, RegisterCommand
+from drivers.mit.codec import DamiaoStatus, Feedback, Register, RegisterCommand, RegisterFrame
 from sim_backend.mit.node import TEMPERATURE_C, MitNode
 from sim_backend.mit.settings import MitNodeSettings
 from sim_backend.node import Transmit
@@ -126,18 +126,17 @@ class DamiaoNode(MitNode):
             self._reply()
             return
         if request.command == RegisterCommand.SAVE:
-            self._answer(RegisterCommand.SAVE, request.register, request.raw)
+            self._answer(request, request.raw)
             return
         if request.register not in self.registers:
             return
         if request.command == RegisterCommand.WRITE:
             self._write(request.register, request.raw)
-        self._answer(
-            RegisterCommand(request.command), request.register, self._raw(request.register)
-        )
+        self._answer(request, self._raw(request.register))
 
-    def _answer(self, command: RegisterCommand, register: int, raw: bytes) -> None:
-        data = codec.pack_register(self.node_id, command, register, raw)
+    def _answer(self, request: RegisterFrame, raw: bytes) -> None:
+        command = RegisterCommand(request.command)
+        data = codec.pack_register(request.node_id, command, request.register, raw)
         self._send(int(self.registers[Register.MASTER_ID]), data)
 
     def _raw(self, register: int) -> bytes:

@@ -12,7 +12,8 @@ class MiniCheetahNode(MitNode):
 
     While disabled, set-points are answered and not looked at, and the last one is remembered: it
     acts again the moment power is back. The watchdog takes the set-point to zero and leaves power
-    on; the next set-point acts as if nothing had been. A fault ends with FD.
+    on; the next set-point acts as if nothing had been. A fault ends with FD, whose answer still
+    tells it.
     """
 
     @property
@@ -33,6 +34,7 @@ class MiniCheetahNode(MitNode):
         if len(data) != codec.FEEDBACK_BYTES:
             return
         self.feed_watchdog()
+        told = self.fault
         if data == codec.ENABLE:
             self.enable()
         elif data == codec.DISABLE:
@@ -44,16 +46,16 @@ class MiniCheetahNode(MitNode):
             codes = codec.parse_command(data)
             if codes is not None:
                 self.follow(codec.to_setpoint(codes, self.ranges))
-        self._reply()
+        self._reply(told)
 
-    def _reply(self) -> None:
+    def _reply(self, fault: int) -> None:
         r = self.ranges
         feedback = Feedback(
             self.node_id,
             codec.to_code(self.position_rad, r.position_rad, codec.POSITION_CODES),
             codec.to_code(self.velocity_rad_s, r.velocity_rad_s, codec.SHORT_CODES),
             codec.to_code(self.servo.torque_Nm, r.torque_Nm, codec.SHORT_CODES),
-            (TEMPERATURE_C, self.fault),
+            (TEMPERATURE_C, fault),
         )
         length = codec.SHORT_FEEDBACK_BYTES if self._is_short else codec.FEEDBACK_BYTES
         self._send(self.settings.reply_id, codec.pack_feedback(feedback, length))

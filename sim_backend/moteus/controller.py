@@ -5,7 +5,6 @@ Source: moteus documentation, "Register Reference" (docs/protocol/registers.md),
 """
 
 import math
-from typing import Any
 
 from drivers.moteus.registers import LIMIT_MAX_TORQUE, Mode
 from sim_backend.servo import Servo
@@ -13,6 +12,7 @@ from sim_backend.servo import Servo
 TAU = 2.0 * math.pi
 ENABLE_S = 5e-3
 """From the first command to mode 10: driver on, current sensors calibrated."""
+POSITION_MAX_REV = 1e6
 OUTSIDE_LIMIT = 39
 """Fault: started outside servopos.position_min and position_max."""
 TORQUE_CONSTANT_KV_Nm_A = 8.27
@@ -124,7 +124,7 @@ class Controller:
 
     def set_position(self, position_rev: float, *, is_exact: bool) -> None:
         """Call the present position this, or the nearest that whole turns of the rotor allow."""
-        if math.isfinite(position_rev):
+        if abs(position_rev) < POSITION_MAX_REV:  # not NaN
             shift = position_rev - self.position_rev()
             self._zero_rev += shift if is_exact else round(shift)
 
@@ -195,6 +195,8 @@ class Controller:
 
     def _apply(self) -> None:
         servo, mode = self.servo, self.mode
+        if mode != Mode.FAULT:
+            self.fault = 0
         if mode == Mode.TIMEOUT:
             mode = self._timeout_behaviour()
         servo.is_energised = mode in _POWERED
@@ -226,7 +228,6 @@ class Controller:
         if not limit_Nm < self.servo.torque_max_Nm:  # NaN: as much as the motor may give
             limit_Nm = self.servo.torque_max_Nm
         if -limit_Nm <= torque_Nm <= limit_Nm:
-            self.fault = 0
             return torque_Nm
         self.fault = LIMIT_MAX_TORQUE
         return math.copysign(max(limit_Nm, 0.0), torque_Nm)
@@ -247,12 +248,12 @@ class Controller:
             settings = self.servo.settings
             gain = settings.torque_constant_Nm_A**2 / settings.resistance_ohm
             return -gain * self.servo.dq_rad_s
-        wanted = -self.configuration["servo.pid_position.kd"] * self.velocity_rev_s()
+        wanted = _finite(-self.configuration["servo.pid_position.kd"] * self.velocity_rev_s())
         limit = self.servo.torque_max_Nm
         if self.mode == Mode.TIMEOUT:
             limit = min(limit, self.configuration["servo.timeout_max_torque_Nm"])
         return max(-limit, min(limit, wanted))
 
 
-def _finite(value: Any) -> float:  # noqa: ANN401 - a register's value
-    return float(value) if math.isfinite(value) else 0.0
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else 0.0

@@ -44,7 +44,7 @@ class EncoderEstimate:
 
     @property
     def velocity_rev_s(self) -> float:
-        """Velocity as of the last tick; below half a count per period it is zero."""
+        """Velocity as of the last tick."""
         return self._rate * self._rev_per_count
 
     def set_position(self, position_rev: float) -> None:
@@ -56,11 +56,11 @@ class EncoderEstimate:
         self.position_rev()
         self._estimate += self._rate * dt_s
         error = self._counts - self._estimate
-        gain = 2.0 * ESTIMATOR_BANDWIDTH_RAD_S
-        self._estimate += gain * error * dt_s
-        self._rate += ESTIMATOR_BANDWIDTH_RAD_S**2 * error * dt_s
-        if abs(self._rate) < 0.25 * ESTIMATOR_BANDWIDTH_RAD_S:
-            self._rate = 0.0  # a real one snaps to zero as well
+        step = ESTIMATOR_BANDWIDTH_RAD_S**2 * dt_s
+        self._estimate += 2.0 * ESTIMATOR_BANDWIDTH_RAD_S * error * dt_s
+        self._rate += step * error
+        if abs(self._rate) < 0.5 * step:  # as the firmware snaps to zero
+            self._rate = 0.0
 
 
 class Controller:

@@ -310,12 +310,14 @@ def test_kit__feedback_ends__torque_off_is_asked_for():
 
 
 def test_kit__joint_that_falls__torque_off_beyond_the_travel_allowed():
-    """Released from a horizontal pose the arm falls; one step after the other is given up."""
+    """Released from a horizontal pose the arm falls as soon as it is enabled."""
     over = {"arm": {"preset": "pelican_v"}, "plant": {"q0_rad": [1.5, 0.0]}}
+    limits = Limits(torque_Nm=1.5, torque_max_Nm=3.0, travel_rad=0.02, watchdog_s=0.02)
     with emulation(**over) as running:
-        results = run_kit(running, steps=only("torque"))
+        results = run_kit(running, limits, steps=only("torque"))
         assert not running.node.drive.machine.is_powered
-    assert any("more than the 0.3 rad allowed: torque off" in r.detail for r in results.values())
+    assert failed(results) == ["enable"]
+    assert "more than the 0.02 rad allowed: torque off" in results["enable"].detail
 
 
 # --- the command ----------------------------------------------------------------------------------

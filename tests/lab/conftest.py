@@ -2,13 +2,15 @@
 
 import os
 import subprocess
+from contextlib import closing
 from itertools import count
 from pathlib import Path
 
 import can
 import pytest
 
-from tests.hil.lab import Lab, wait_until
+from tests.conftest import make_vcan
+from tests.hil.lab import BusWatcher, Lab, wait_until
 
 _numbers = count(1)
 FAIR = "loop.realtime=off"
@@ -38,10 +40,7 @@ class CanLab(Lab):
 
     def tool(self, *command):
         """Start a program of can-utils; its output goes to a file."""
-        return self.enter(Tool(self.directory / f"tool{next(_numbers)}", command))
-
-    def enter(self, context):
-        return self._stack.enter_context(context)
+        return Tool(self.directory / f"tool{next(_numbers)}", command)
 
 
 class Tool:
@@ -76,6 +75,46 @@ class Tool:
     def __exit__(self, *_):
         self.process.terminate()
         self.process.wait(10)
+
+
+class Bench:
+    """An arm on a CAN interface: daemons are started when none runs, and kept for the next test."""
+
+    def __init__(self, lab):
+        self.lab = lab
+        self.interface = lab.interface
+        self._arm = None
+
+    def moving_arm(self):
+        """The running daemon's arm in the middle of a swing."""
+        if self._arm is None or self._arm.daemon.process.poll() is not None:
+            if self._arm is not None:
+                self._arm.client.close()
+            self._arm = self.lab.run()
+        self._arm.make_ready()
+        self._arm.events.clear()
+        self._arm.swing()
+        return self._arm
+
+    def watch(self):
+        """Listen to the bus for as long as the block lasts."""
+        return closing(BusWatcher(self.lab.join_bus()))
+
+
+@pytest.fixture(scope="module")
+def shared_vcan():
+    """A vcan interface for all tests of a module."""
+    yield from make_vcan()
+
+
+@pytest.fixture(scope="module")
+def bench(shared_vcan, tmp_path_factory):
+    if shared_vcan is None:
+        pytest.skip("not allowed to make a vcan interface")
+    lab = CanLab(tmp_path_factory.mktemp("bench"), shared_vcan)
+    lab.emulate()
+    yield Bench(lab)
+    lab.close()
 
 
 @pytest.fixture
