@@ -6,7 +6,7 @@ from math import inf
 from time import monotonic, sleep, time
 
 from drivers.bus import Bus, split_address
-from drivers.database import FrameDecoder, frame_label
+from drivers.decoder import FrameDecoder, frame_label
 from drivers.frame import ERR_FLAG, unpack_header
 from hil.errors import HilError
 

@@ -21,6 +21,8 @@ LONGEST_PULSE = 16
 """The direction of motion is sought with pulses of up to so many times the shortest."""
 VISIBLE_STEPS = 6
 """Encoder steps a joint has to move for the direction to be beyond doubt."""
+VISIBLE_RAD = 5e-3
+"""It has to move as far as this, too: an encoder's noise is not motion."""
 LEVELS = (0.25, 0.5, 1.0)
 """Shares of `Limits.torque_Nm` that are asked for."""
 OVER_LIMIT = 10.0
@@ -86,6 +88,10 @@ def _mean_before(values: list[float], end: int) -> float:
     return sum(part) / len(part)
 
 
+def _thousandths(value: float) -> str:
+    return f"{1e3 * value:.3g}" if value >= 1e-6 else "less than 0.001"
+
+
 def _cycles(count: int) -> str:
     return f"{count} cycle{'' if count == 1 else 's'}"
 
@@ -145,8 +151,8 @@ def start_up(bench: Bench) -> str:
         raise StepError(bench.start_error)
     mode = "lockstep" if info.is_lockstep else "by its own clock"
     return (
-        f"{info.name}, {mode}; torque in steps of {1e3 * info.torque_resolution_Nm:.3g} mNm, "
-        f"angle of {1e3 * info.angle_resolution_rad:.3g} mrad"
+        f"{info.name}, {mode}; torque in steps of {_thousandths(info.torque_resolution_Nm)} mNm, "
+        f"angle of {_thousandths(info.angle_resolution_rad)} mrad"
     )
 
 
@@ -196,7 +202,7 @@ def motion(bench: Bench) -> str:
     if bench.limits.is_clamped:
         raise NotAskedError("the joint is clamped")
     resolution_rad = bench.info.angle_resolution_rad if bench.info is not None else 0.0
-    visible_rad = VISIBLE_STEPS * resolution_rad
+    visible_rad = max(VISIBLE_STEPS * resolution_rad, VISIBLE_RAD)
     cycles, apart_rad = PLATEAU_CYCLES, 0.0
     while cycles <= LONGEST_PULSE * PLATEAU_CYCLES:
         up = pulse(bench, bench.limits.torque_Nm, cycles)
@@ -310,8 +316,8 @@ def _state(bench: Bench) -> str:
 
 def stays_off(bench: Bench) -> str:
     """Commands come back: torque does not, until somebody asks for it."""
-    if bench.bus.is_enabled:
-        raise StepError("the drive is enabled")
+    if bench.bus.is_enabled:  # a loss that failed has disabled it
+        raise NotAskedError("the drive did not lose its commands")
     for _ in range(4 * SETTLED_CYCLES):
         bench.cycle(LEVELS[0] * bench.limits.torque_Nm)
         if bench.bus.is_enabled:

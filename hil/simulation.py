@@ -127,7 +127,7 @@ class Simulation:
             bit_rate=config.bus.bit_rate,
             data_bit_rate=config.bus.data_bit_rate,
         )
-        emulator = build_wired_emulator(config, wire.ports)
+        emulator = self._emulator = build_wired_emulator(config, wire.ports)
         wire.connect(emulator)
         wire.model.on_window = self._report_load
         loopback.connect(wire.send, self._wait_wired)
@@ -141,6 +141,8 @@ class Simulation:
     def step(self) -> None:
         """Run one cycle and record it."""
         start_ns = self._clock_ns
+        if self.wire is not None and self._emulator is not None:  # it will have moved on by the end
+            self._motion = self._emulator.arm.q_rad, self._emulator.arm.dq_rad_s
         self._executor.begin_cycle(1)
         self.control.step(start_ns + self._timeout_ns, 1)
         if self.wire is None:
@@ -148,7 +150,6 @@ class Simulation:
             self._clock_ns += self._period_ns
         else:
             stamps = self._stamps(start_ns)
-            self._motion = self._plant.q_true_rad, self._plant.dq_true_rad_s
             self._clock_ns = self.wire.advance(start_ns + self._period_ns)
             self._record(start_ns, stamps)
         self.cycle += 1
@@ -222,7 +223,7 @@ class Simulation:
 
     def _truth(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
         plant = self._plant
-        if self.wire is not None:  # the plant has moved on to the end of the cycle
+        if self.wire is not None:
             return *self._motion, plant.tau_applied_Nm
         return plant.q_true_rad, plant.dq_true_rad_s, plant.tau_applied_Nm
 

@@ -278,7 +278,8 @@ def main() -> int:
                         help="without a lab only warn, unless CI=true")  # fmt: skip
     parser.add_argument("command", nargs="+")
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, _exit_on_signal)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, _exit_on_signal)
     try:
         return run(options)
     except LabError as error:

@@ -10,7 +10,8 @@ from pathlib import Path
 from time import monotonic
 
 from drivers.bus import open_bus
-from drivers.database import FrameDecoder, arm_database
+from drivers.database import arm_database
+from drivers.decoder import FrameDecoder
 from drivers.frame_log import FrameLogError, FrameLogWriter, read_log, require_suffix
 from hil.bus_tools import BusToolError, Monitor, frames_of, is_virtual, play
 from hil.cli.options import add_configuration, configuration

@@ -12,7 +12,8 @@ from typing import TypeVar
 
 from drivers.arm_bus import SENT, ArmBus
 from drivers.bus import open_bus
-from drivers.database import DatabaseError, FrameDecoder, frame_label
+from drivers.database import DatabaseError
+from drivers.decoder import FrameDecoder, frame_label
 from drivers.frame_log import FrameLogWriter
 from drivers.registry import SETTINGS, heartbeat_cycles, make_axes
 from drivers.settings import AxisSettings

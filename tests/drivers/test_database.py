@@ -14,15 +14,35 @@ from drivers.cia402 import codec
 from drivers.cia402.codec import Index
 from drivers.cia402.sdo import SdoKind, parse_sdo_request, parse_sdo_response
 from drivers.cia402.settings import Cia402Settings
-from drivers.database import FrameDecoder, arm_database, dbc_path, frame_label
-from drivers.frame import EFF_FLAG, ERR_FLAG, LOCKSTEP_ID, RTR_FLAG, pack_frame, unpack_frame
+from drivers.database import arm_database, dbc_path
+from drivers.decoder import FrameDecoder, frame_label
+from drivers.frame import (
+    EFF_FLAG,
+    ERR_FLAG,
+    LOCKSTEP_ID,
+    RTR_FLAG,
+    pack_fd_frame,
+    pack_frame,
+    unpack_frame,
+)
+from drivers.mit import codec as mit
+from drivers.mit.settings import MitSettings
+from drivers.moteus.settings import MoteusSettings
+from drivers.odrive import codec as odrive
+from drivers.odrive.settings import OdriveSettings
 
 GOLDEN = Path(__file__).parent / "golden" / "cia402_startup.txt"
 AXES = (
     Cia402Settings(node_id=1, rated_torque_Nm=5.0, torque_max_Nm=15.0),
     Cia402Settings(node_id=7, rated_torque_Nm=2.5, torque_max_Nm=8.0, direction=-1, offset_rad=0.1),
 )
+ODRIVE = OdriveSettings(node_id=3, torque_max_Nm=10.0, gear_ratio=8.0, direction=-1, offset_rad=0.2)
+DAMIAO = MitSettings(
+    node_id=4, torque_range_Nm=10.0, torque_max_Nm=10.0, direction=-1, offset_rad=-0.3
+)
 DECODER = FrameDecoder(AXES)
+MIXED = FrameDecoder([AXES[0], ODRIVE, DAMIAO])
+FAMILIES = {"cia402": AXES[0], "odrive": ODRIVE, "damiao": DAMIAO}
 i16 = st.integers(-(2**15), 2**15 - 1)
 i32 = st.integers(-(2**31), 2**31 - 1)
 u16 = st.integers(0, 2**16 - 1)
@@ -38,7 +58,7 @@ def golden_frames():
 
 @pytest.fixture(scope="module")
 def shipped():
-    return cantools.database.load_file(dbc_path("cia402"))
+    return cantools.database.load_file(dbc_path(AXES[0]))
 
 
 # --- the file as shipped --------------------------------------------------------------------------
@@ -68,11 +88,26 @@ def test_dbc__tpdo1_by_cantools_alone__raw_values_of_the_codec(shipped, status, 
     assert values["FollowsCommand"] == bool(status & codec.STATUS_FOLLOWS_COMMAND)
 
 
-def test_dbc__shipped_with_the_package():
+@pytest.mark.parametrize("name", FAMILIES)
+def test_dbc__shipped_with_the_package__read_by_cantools_strictly(name):
     """A wheel has it: the pattern of the package data matches the file."""
     project = Path(__file__).parents[2]
     assert 'drivers = ["**/*.dbc"]' in (project / "pyproject.toml").read_text()
-    assert dbc_path("cia402").relative_to(project) == Path("drivers/cia402/cia402.dbc")
+    path = dbc_path(FAMILIES[name])
+    assert path.relative_to(project).parts[0] == "drivers"
+    assert path.name == f"{name}.dbc"
+    assert cantools.database.load_file(path, strict=True).messages
+
+
+@pytest.mark.parametrize(
+    "axis",
+    [MoteusSettings.model_construct(family="moteus"),
+     MitSettings(node_id=1, variant="robstride", torque_range_Nm=10.0, torque_max_Nm=10.0)],
+    ids=["moteus", "robstride"],
+)  # fmt: skip
+def test_dbc__frames_that_no_dbc_can_describe__left_out(axis):
+    assert dbc_path(axis) is None
+    assert arm_database([axis]).messages == []
 
 
 # --- an arm's own ---------------------------------------------------------------------------------
@@ -166,11 +201,11 @@ def expect_sdo(values, parsed):
          "J2_RPDO1 Controlword='enable operation' TargetTorque=-0.025 Nm"),
         (pack_frame(0x081, bytes.fromhex("5082110000000000")),
          "J1_EMCY ErrorCode='8250 RPDO timeout' ErrorRegister=17 VendorSpecific=0x0000000000"),
-        (pack_frame(0x201, b"\x0f"), "0F"),  # too short for what it should be
-        (pack_frame(0x333, b"\x01\x02"), "01 02"),
-        (pack_frame(EFF_FLAG | 0x181, bytes(8)), "00 00 00 00 00 00 00 00"),  # 29 bits: another one
-        (pack_frame(RTR_FLAG | 0x181), "remote request"),
-        (pack_frame(ERR_FLAG | 4, bytes(8)), "controller error report 00 00 00 00 00 00 00 00"),
+        (pack_frame(0x201, b"\x0f"), ""),  # too short for what it should be
+        (pack_frame(0x333, b"\x01\x02"), ""),
+        (pack_frame(EFF_FLAG | 0x181, bytes(8)), ""),  # 29 bits: another one
+        (pack_frame(RTR_FLAG | 0x181), "J1_TPDO1 requested"),
+        (pack_frame(ERR_FLAG | 4, bytes(8)), "error report of the CAN controller"),
         (pack_frame(LOCKSTEP_ID), "emulated time: one period"),
     ],
 )  # fmt: skip
@@ -185,6 +220,7 @@ def test_describe__frames_of_every_kind__one_line(frame, text):
         (pack_frame(EFF_FLAG | 0x81), "00000081#"),
         (pack_frame(RTR_FLAG | 0x81), "081#R"),
         (pack_frame(ERR_FLAG | 4, b"\0"), "20000004#00"),
+        (pack_fd_frame(0x100, b"\x21\x00"), "100##52100"),
     ],
 )
 def test_frame_label__as_candump_writes_it(frame, label):
@@ -193,20 +229,111 @@ def test_frame_label__as_candump_writes_it(frame, label):
 
 @given(can_id=st.integers(0, 2**32 - 1), data=st.binary(max_size=8))
 def test_describe__whatever_is_on_the_bus__never_raises(can_id, data):
-    assert DECODER.describe(pack_frame(can_id, data))
+    assert "\n" not in MIXED.describe(pack_frame(can_id, data))
 
 
-@given(can_id=st.sampled_from([0, 0x80, 0x81, 0x181, 0x201, 0x281, 0x581, 0x601, 0x701, 0x77F]),
-       data=st.binary(max_size=8))  # fmt: skip
+KNOWN_IDS = sorted(message.frame_id for message in arm_database([AXES[0], ODRIVE, DAMIAO]).messages)
+
+
+@given(can_id=st.sampled_from(KNOWN_IDS), data=st.binary(max_size=8))
 def test_describe__known_identifier_any_bytes__never_raises(can_id, data):
-    assert DECODER.describe(pack_frame(can_id, data))
+    assert "\n" not in MIXED.describe(pack_frame(can_id, data))
+
+
+# --- other families -------------------------------------------------------------------------------
+
+
+def of_odrive(command, data=b""):
+    return pack_frame(odrive.can_id(3, command), data)
+
+
+finite = st.floats(-1e6, 1e6, width=32)
+
+
+@given(position=finite, velocity=finite)
+def test_odrive__encoder__joint_units_of_the_codecs_values(position, velocity):
+    data = odrive.F32_PAIR.pack(position, velocity)
+    values = MIXED.decode(of_odrive(odrive.Command.ENCODER, data)).values
+    found = odrive.parse_f32_pair(data)
+    assert values["Position"] == pytest.approx(-found[0] * math.tau / 8.0 + 0.2)
+    assert values["Velocity"] == pytest.approx(-found[1] * math.tau / 8.0)
+
+
+@given(
+    errors=st.lists(st.sampled_from(list(odrive.AxisError)), unique=True),
+    state=st.sampled_from(list(odrive.AxisState)),
+    result=st.sampled_from(list(odrive.ProcedureResult)),
+)
+def test_odrive__heartbeat__state_result_and_each_error_by_name(errors, state, result):
+    bits = sum(errors)
+    data = odrive.pack_heartbeat(odrive.Heartbeat(bits, state, result, True))
+    values = MIXED.decode(of_odrive(odrive.Command.HEARTBEAT, data)).values
+    assert values["State"] == state.name.replace("_", " ").lower()
+    assert values["Result"] == result.name.replace("_", " ").lower()
+    named = {key.lower() for key, value in values.items() if value == 1}
+    assert named == {error.name.replace("_", "").lower() for error in errors} | {"trajectorydone"}
+
+
+@pytest.mark.parametrize("padding", [b"", bytes(4)], ids=["4 bytes", "8 bytes"])
+def test_odrive__torque__of_either_length_at_the_joint(padding):
+    frame = of_odrive(odrive.Command.INPUT_TORQUE, odrive.F32.pack(0.25) + padding)
+    assert MIXED.describe(frame) == "J2_InputTorque TorqueSetpoint=-2 Nm"
+
+
+def test_odrive__empty_frame_of_the_encoder__is_a_poll():
+    assert MIXED.describe(of_odrive(odrive.Command.ENCODER)) == "J2_Encoder requested"
+
+
+codes16, codes12 = st.integers(0, 0xFFFF), st.integers(0, 0xFFF)
+
+
+@given(position=codes16, velocity=codes12, torque=codes12,
+       status=st.sampled_from(list(mit.DamiaoStatus)))  # fmt: skip
+def test_damiao__reply__joint_units_of_the_codecs_values(position, velocity, torque, status):
+    head = 4 | status << 4
+    data = mit.pack_feedback(mit.Feedback(head, position, velocity, torque, (31, 42)))
+    values = MIXED.decode(pack_frame(DAMIAO.reply_id, data)).values
+    ranges = DAMIAO.ranges
+    q_rad = mit.to_value(position, ranges.position_rad, mit.POSITION_CODES)
+    assert values["Position"] == pytest.approx(-q_rad - 0.3)
+    tau_Nm = mit.to_value(torque, ranges.torque_Nm, mit.SHORT_CODES)
+    assert values["Torque"] == pytest.approx(-tau_Nm)
+    assert values["Velocity"] == pytest.approx(
+        -mit.to_value(velocity, ranges.velocity_rad_s, mit.SHORT_CODES)
+    )
+    assert values["Status"] == status.name.replace("_", " ").lower()
+    assert (values["Node"], values["MosfetTemperature"], values["RotorTemperature"]) == (4, 31, 42)
+
+
+@given(codes=st.builds(mit.Codes, codes16, codes12, codes12, codes12, codes12))
+def test_damiao__command__joint_units_of_the_codecs_values(codes):
+    values = MIXED.decode(pack_frame(4, mit.pack_codes(codes))).values
+    if not values:  # seven bytes FF: no set-point for the codec either
+        assert mit.parse_command(mit.pack_codes(codes)) is None
+        return
+    setpoint = mit.to_setpoint(codes, DAMIAO.ranges)
+    assert values["Position"] == pytest.approx(-setpoint.position_rad - 0.3)
+    assert values["TargetTorque"] == pytest.approx(-setpoint.torque_Nm)
+    assert values["Kp"] == pytest.approx(setpoint.kp_Nm_rad)
+    assert values["Kd"] == pytest.approx(setpoint.kd_Nms_rad)
+
+
+def test_damiao__special_commands__by_name():
+    found = [MIXED.describe(pack_frame(4, data))
+             for data in (mit.ENABLE, mit.DISABLE, mit.SET_ZERO, mit.CLEAR_FAULT)]  # fmt: skip
+    names = ("enable", "disable", "set zero", "clear fault")
+    assert found == [f"J3_Command {name}" for name in names]
+
+
+# --- cantools missing -----------------------------------------------------------------------------
 
 
 def test_decoder__cantools_not_installed__one_line_with_the_remedy():
     """In a process of its own, in which cantools cannot be found."""
     program = (
         "import sys; sys.modules['cantools'] = None\n"
-        "from drivers.database import DatabaseError, FrameDecoder\n"
+        "from drivers.database import DatabaseError\n"
+        "from drivers.decoder import FrameDecoder\n"
         "try:\n    FrameDecoder([])\n"
         "except DatabaseError as error:\n    print(error)\n"
     )

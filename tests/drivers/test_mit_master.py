@@ -151,7 +151,12 @@ def test_configure__damiao_in_another_control_mode__put_into_mit_mode():
 def test_configure__another_master_sends_to_the_motor__refused(variant):
     rig = rig_of(variant)
     other = pack_frame(0x001, codec.ENABLE)
-    rig.loopback.connect(rig._from_master, lambda _: rig.loopback.deliver(other))
+
+    def wait(timeout_s):
+        rig._wait(timeout_s)
+        rig.loopback.deliver(other)
+
+    rig.loopback.connect(rig._from_master, wait)
     with pytest.raises(AmplifierError, match="another master sends to identifier 0x1"):
         rig.configure()
 

@@ -17,6 +17,7 @@ from drivers.registry import SETTINGS, find_clash, make_axes
 from drivers.settings import AxisSettings
 from tests.drivers.axis_rig import AxisRig, keep
 from tests.drivers.test_odrive_codec import vendor_file
+from tests.odrive_fuzz import FUZZ_FRAMES, babble, random_source
 
 GOLDEN = Path(__file__).parent / "golden" / "odrive_startup.txt"
 FAULT_CYCLES = 21
@@ -587,6 +588,42 @@ def test_handlers__any_length__nothing_raised_and_nothing_finite_lost(command, l
     for fill in (0x00, 0x7F, 0xFF):
         tell(axis, pack_frame(codec.can_id(1, command), bytes([fill] * length)))
         assert math.isfinite(axis.q_rad + axis.dq_rad_s + axis.tau_meas_Nm)
+
+
+SENSIBLE = (
+    (Command.ENCODER, codec.F32_PAIR.pack(0.25, -1.0)),
+    (Command.HEARTBEAT, unpack_frame(heartbeat())[1]),
+    (Command.HEARTBEAT, unpack_frame(heartbeat(state=AxisState.CLOSED_LOOP_CONTROL))[1]),
+    (Command.HEARTBEAT, unpack_frame(heartbeat(errors=AxisError.DRV_FAULT))[1]),
+    (Command.ERROR, codec.U32_PAIR.pack(0, AxisError.MISSING_ESTIMATE)),
+    (Command.TORQUES, codec.F32_PAIR.pack(1.0, 0.9)),
+    (Command.TX_SDO, codec.pack_sdo(codec.Sdo(0, 0xFE01, b"\1"))),
+)
+
+
+def test_fuzz__random_and_mutated_frames__no_exception_torque_limited_states_legal(capsys):
+    chance = random_source(capsys, "odrive master")
+    axis, powered = lone_axis(parameters="preset"), 0
+    handlers = axis.handlers()
+    for count in range(FUZZ_FRAMES):
+        if count % 50 == 0:
+            chance.choice((axis.enable, axis.enable, axis.disable, axis.reset_fault))()
+        command, data = babble(chance, SENSIBLE)
+        handler = handlers.get(codec.can_id(1, command))
+        if handler is not None:
+            handler(pack_frame(codec.can_id(1, command), data))
+        axis.request()
+        can_id, sent = unpack_frame(axis.command(chance.uniform(-40.0, 40.0)))
+        axis.end_cycle()
+        assert isinstance(axis.status, AxisStatus)
+        assert math.isfinite(axis.q_rad + axis.dq_rad_s + axis.tau_meas_Nm)
+        assert can_id in handlers or can_id >> 5 == 1
+        if can_id == 0x02E:
+            torque_Nm = codec.parse_f32(sent)
+            assert abs(torque_Nm) <= 15.0
+            assert torque_Nm == 0.0 or axis.status is AxisStatus.ENABLED
+            powered += torque_Nm != 0.0
+    assert powered > FUZZ_FRAMES / 100, "it was hardly ever under power"
 
 
 # --- identifiers --------------------------------------------------------------------------------

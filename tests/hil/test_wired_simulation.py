@@ -78,6 +78,16 @@ def test_wired__everything_in_time__every_sample_as_without_the_wire(plain, wire
     assert before["state"][-1] == State.ACTIVE
 
 
+def test_wired__fd_frames_without_sync__every_sample_as_without_the_wire():
+    families = ("axes.1.family=moteus", "axes.2.family=moteus")
+    (_, without), (_, with_wire) = swing(*families, cycles=300), swing(*families, WIRE, cycles=300)
+    before, after = without.samples(), with_wire.samples()
+    different = {n for n in before.dtype.names if not np.array_equal(before[n], after[n])}
+    assert different == IN_TIME
+    assert before["state"][-1] == State.ACTIVE
+    assert 0 < after["feedback_ns"].min() < after["feedback_ns"].max() < 500_000
+
+
 def test_wired__same_run_again__same_bytes(wired):
     _, again = swing(WIRE)
     _, first = wired

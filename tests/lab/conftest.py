@@ -15,6 +15,8 @@ from tests.hil.lab import BusWatcher, Lab, wait_until
 _numbers = count(1)
 FAIR = "loop.realtime=off"
 """The lab's kernel has one processor: two real-time processes would starve the others."""
+BRAKED = tuple(f"plant.links.{j}.viscous_Nms_rad=1.0" for j in (1, 2))
+"""An arm without torque comes to rest before it is at its limits."""
 
 
 def ip(*words):
@@ -33,7 +35,7 @@ class CanLab(Lab):
         self.bus = self.interface = interface
 
     def settings(self, *assignments):
-        return super().settings(FAIR, *assignments)
+        return super().settings(FAIR, *BRAKED, *assignments)
 
     def join_bus(self):
         return can.Bus(interface="socketcan", channel=self.interface)
@@ -87,6 +89,7 @@ class Bench:
 
     def moving_arm(self):
         """The running daemon's arm in the middle of a swing."""
+        _be_up(self.interface)
         if self._arm is None or self._arm.daemon.process.poll() is not None:
             if self._arm is not None:
                 self._arm.client.close()
@@ -99,6 +102,11 @@ class Bench:
     def watch(self):
         """Listen to the bus for as long as the block lasts."""
         return closing(BusWatcher(self.lab.join_bus()))
+
+
+def _be_up(interface):
+    """Whatever an earlier test has left."""
+    ip("link", "set", interface, "up")
 
 
 @pytest.fixture(scope="module")

@@ -68,8 +68,8 @@ def test_second_daemon__same_bus__refuses_and_leaves_the_first_alone(bench):
     rival = bench.lab.start(
         "run", *bench.lab.settings("arm.name=rival", "zenoh.listen=[]"), "--no-record"
     )
-    assert rival.wait() == 1
-    assert "another master sends SYNC on this bus; stop the other daemon first" in one_line(rival)
+    assert rival.wait(120) == 1
+    assert "another master" in one_line(rival)  # its SYNC is heard, or a drive is enabled already
     assert arm.state_now() is State.ACTIVE
     assert not any(event["kind"] == "fault" for event in arm.events)
 
@@ -154,5 +154,5 @@ def test_cangen__flood_of_random_frames__no_exception_and_torque_in_bounds(bench
 def test_interface__deleted_in_motion__daemon_ends_with_one_line(bench):
     arm = bench.moving_arm()
     ip("link", "delete", bench.interface)
-    assert arm.daemon.wait() == 1
+    assert arm.daemon.wait(120) == 1
     assert f"no bus socketcan:{bench.interface}: " in one_line(arm.daemon)
