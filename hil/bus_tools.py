@@ -65,14 +65,19 @@ class Monitor:
     Attributes:
         decoder: Names the fields; None shows bytes.
         interval_s: Shortest time between two lines of one identifier; 0 prints every frame.
+        now_s: Clock for the rates.
         frames: Frames taken so far.
     """
 
     decoder: FrameDecoder | None
     interval_s: float = 0.0
+    now_s: Callable[[], float] = monotonic
     frames: int = 0
     _rows: dict[int, _Row] = field(default_factory=dict)
-    _refreshed_s: float = field(default_factory=monotonic)
+    _refreshed_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._refreshed_s = self.now_s()
 
     def take(self, t_s: float, frame: bytes) -> str | None:
         """Count a frame; return its line, or None if its identifier had one a moment ago.
@@ -89,11 +94,11 @@ class Monitor:
             return None
         row.printed_s = t_s
         text = f"  {self.decoder.describe(frame)}" if self.decoder is not None else ""
-        return f"({t_s:.6f}) {frame_label(frame):24}{text}"
+        return f"({t_s:.6f}) {frame_label(frame):24}{text}".rstrip()
 
     def table(self) -> str:
         """Return one line per identifier: count, rate since the last table, last frame."""
-        now_s = monotonic()
+        now_s = self.now_s()
         passed_s, self._refreshed_s = now_s - self._refreshed_s, now_s
         lines = [f"{'frame':28}{'count':>9}{'Hz':>9}  {self.frames} frames"]
         for _, row in sorted(self._rows.items()):

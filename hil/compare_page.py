@@ -1,5 +1,6 @@
 """The page beside a comparison's tables: its origin, what its words mean, and an overview."""
 
+import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
@@ -76,7 +77,8 @@ def _origin(rows: Sequence[Row], command: str) -> Iterator[str]:
     yield "|---|---|"
     yield f"| command | `{command}` |"
     yield f"| program | hil {version('hil')} |"
-    yield f"| machine | {cpu_model()}, {platform.system()} {platform.release()} |"
+    host = f"{cpu_model()}, {os.cpu_count()} cores"
+    yield f"| machine | {host}, {platform.system()} {platform.release()} |"
     software = " ".join(f"{name} {version(name)}," for name in ("pymunk", "numpy"))
     yield f"| software | Python {platform.python_version()}, {software.rstrip(',')} |"
     spent_s = sum(row.cpu_s for row in rows)

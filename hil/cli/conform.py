@@ -112,7 +112,6 @@ def run(options: argparse.Namespace) -> int:
     settings = config.axes[joint - 1]
     limits = _limits(options, settings, config)
     _confirm(options, config, joint, limits)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     limited = _limited(settings, limits)
     axes = list(config.axes)
     axes[joint - 1] = limited
@@ -125,6 +124,8 @@ def run(options: argparse.Namespace) -> int:
     )
     printer = _Printer(options, _decoder(config))
     with ExitStack() as stack:
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        stack.callback(signal.signal, signal.SIGTERM, before)
         writer = stack.enter_context(FrameLogWriter(options.log)) if options.log else None
         bus = ArmBus(open_bus(config.bus.address), [axis], now_ns=monotonic_ns)
         stack.callback(bus.close)

@@ -360,6 +360,20 @@ def running():
         yield running
 
 
+@pytest.mark.parametrize("family", ["mit", "moteus", "odrive"])
+def test_conform__every_other_family__passes_what_it_can_be_asked(capsys, family):
+    with emulation(axes={"1": {"family": family}}) as running:
+        status, out, _ = conform(
+            capsys, family, "--bus", running.address,
+            "--set", f"emulator.stall_timeout_s={STALL_S}",
+        )  # fmt: skip
+        assert not running.node.servo.is_energised
+    assert status == 0, out
+    assert "18 pass, 0 fail, 3 not asked, 0 not reached" in out
+    assert "not asked    loss of commands " in out
+    assert "pass         loss of master " in out
+
+
 def test_conform__as_a_process__steps_frames_log_and_status_0(running, tmp_path):
     log = tmp_path / "run.asc"
     process = HilProcess(
