@@ -29,6 +29,8 @@ class AxisInfo:
     angle_resolution_rad: float
     is_lockstep: bool
     """Emulated, and its time advances by one period per SYNC instead of by the clock."""
+    is_emulated: bool = False
+    """It said that it is emulated: faults may be asked for (`drivers.fault_frame`)."""
 
 
 class Port(Protocol):

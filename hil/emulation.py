@@ -13,6 +13,7 @@ from sim_backend.arm import Arm
 from sim_backend.cia402 import node as cia402
 from sim_backend.emulator import Emulator
 from sim_backend.errors import SimError
+from sim_backend.faults import Faults
 from sim_backend.hub import Wire, open_wire
 from sim_backend.mit.node import make_node
 from sim_backend.mit.settings import MitNodeSettings
@@ -37,11 +38,12 @@ def build_emulator(config: Config, transmit: Transmit, *, is_lockstep: bool) -> 
         SimError: If the plant cannot be built as configured.
     """
     servos = [Servo(settings) for settings in config.servos]
+    faults = Faults(config.emulator.faults, servos, [transmit] * len(servos))
     nodes = [
-        _NODES[axis.family](axis, servo, transmit, is_lockstep=is_lockstep)
-        for axis, servo in zip(config.axes, servos, strict=True)
+        _NODES[axis.family](axis, servo, faults.output(j), is_lockstep=is_lockstep)
+        for j, (axis, servo) in enumerate(zip(config.axes, servos, strict=True))
     ]
-    return Emulator(Arm(config.plant), servos, nodes, is_lockstep=is_lockstep)
+    return Emulator(Arm(config.plant), servos, nodes, is_lockstep=is_lockstep, faults=faults)
 
 
 def build_wired_emulator(config: Config, ports: Sequence[Port]) -> Emulator:
@@ -51,11 +53,12 @@ def build_wired_emulator(config: Config, ports: Sequence[Port]) -> Emulator:
         SimError: If the plant cannot be built as configured.
     """
     servos = [Servo(settings) for settings in config.servos]
+    faults = Faults(config.emulator.faults, servos, [port.send for port in ports])
     nodes = [
-        port.attach(_NODES[axis.family](axis, servo, port.send, is_lockstep=False))
-        for axis, servo, port in zip(config.axes, servos, ports, strict=True)
+        port.attach(_NODES[axis.family](axis, servo, faults.output(j), is_lockstep=False))
+        for j, (axis, servo, port) in enumerate(zip(config.axes, servos, ports, strict=True))
     ]
-    return Emulator(Arm(config.plant), servos, nodes, is_lockstep=False)
+    return Emulator(Arm(config.plant), servos, nodes, is_lockstep=False, faults=faults)
 
 
 def open_emulation(config: Config, settings: EmulatorSettings) -> tuple[Wire, Emulator]:

@@ -7,12 +7,15 @@ advances everything by one period; otherwise the caller passes the wall's time o
 
 from collections.abc import Sequence
 
+from drivers.fault_frame import FAULT_ID, parse_fault
 from drivers.frame import ERR_FLAG, FRAME_SIZE, LOCKSTEP_ID, RTR_FLAG, is_fd, unpack_frame
 from sim_backend.arm import Arm
 from sim_backend.chain import CURRENT_LOOP_PERIOD_NS
 from sim_backend.errors import SimError
+from sim_backend.faults import Faults
 from sim_backend.node import AmplifierNode
 from sim_backend.servo import CURRENT_LOOP_PERIOD_S, Servo
+from sim_backend.settings import FaultSettings
 
 SYNC_ID = 0x080
 TICK_S = 1e-3
@@ -30,6 +33,8 @@ class Emulator:
         servos: One per joint, shoulder first.
         nodes: The amplifiers that command these servos, in any order.
         is_lockstep: SYNC advances time. May be changed at any instant.
+        faults: Through which the nodes send (`Faults.output`); left out, there are no faults on
+            the frames that they send. Needs one node per joint, shoulder first.
 
     Attributes:
         is_lockstep: See above.
@@ -45,6 +50,7 @@ class Emulator:
     __slots__ = (
         "_arm",
         "_cyclic_nodes",
+        "_faults",
         "_fd_nodes",
         "_first_half_Nm",
         "_is_waiting",
@@ -66,6 +72,7 @@ class Emulator:
         nodes: Sequence[AmplifierNode],
         *,
         is_lockstep: bool,
+        faults: Faults | None = None,
     ) -> None:
         count = len(arm.q_rad)
         if len(servos) != count or len(nodes) != count:
@@ -80,9 +87,13 @@ class Emulator:
         self._fd_nodes = [n for n in nodes if n.takes_fd]
         self._remote_nodes = [n for n in nodes if n.takes_remote_requests]
         self.is_lockstep = is_lockstep
+        self._faults = faults or Faults(FaultSettings(), servos, [_lose] * count)
+        self._faults.connect(nodes, self._reach_nodes)
         self._is_waiting = arm.settings.is_held_until_enabled
         if self._is_waiting:
             arm.hold()
+        else:
+            self._faults.start_schedule(0)
         self._remainder_ns = 0
         self._first_half_Nm: list[float] | None = None
         self.tau_applied_Nm = [0.0] * count
@@ -117,6 +128,9 @@ class Emulator:
         Raises:
             PlantError: If the arm broke down while advancing.
         """
+        if not self._faults.is_quiet:
+            self._receive_through_faults(frame)
+            return
         if len(frame) != FRAME_SIZE:
             if is_fd(frame):
                 self._receive_fd(frame)
@@ -124,6 +138,9 @@ class Emulator:
         can_id, data = unpack_frame(frame)
         if can_id & _NOT_DATA:
             self._receive_remote(can_id, data)
+            return
+        if can_id == FAULT_ID:
+            self._take_fault(data)
             return
         if can_id != SYNC_ID and can_id != LOCKSTEP_ID:  # noqa: PLR1714 - every frame
             for node in self._nodes:
@@ -146,6 +163,48 @@ class Emulator:
         if not can_id & _NOT_DATA:
             for node in self._fd_nodes:
                 node.receive(can_id, data)
+
+    # --- faults -------------------------------------------------------------------------------
+
+    def _take_fault(self, data: bytes) -> None:
+        order = parse_fault(data)
+        if order is not None:
+            self._faults.take(order, self._period)
+
+    def _receive_through_faults(self, frame: bytes) -> None:
+        """Do as `receive` does, while a fault acts: time goes on even if nobody hears its tick."""
+        can_id, data = unpack_frame(frame)
+        if can_id == FAULT_ID:
+            self._take_fault(data)
+            return
+        is_tick = can_id in (SYNC_ID, LOCKSTEP_ID)
+        if is_tick:
+            self._latch_truth()
+            if self.is_lockstep:
+                self._faults.begin_period(is_lockstep=True)
+        self._faults.send_from_host(frame)
+        if is_tick and self.is_lockstep:
+            self._begin_period()
+            self.advance_period()
+
+    def _reach_nodes(self, frame: bytes) -> None:
+        """Hand a frame that has come through to the nodes that take such, and are not deaf."""
+        can_id, data = unpack_frame(frame)
+        if can_id & ERR_FLAG:
+            return
+        for joint, node in enumerate(self._nodes):
+            is_for_it = (node.takes_fd or not is_fd(frame)) and (
+                node.takes_remote_requests or not can_id & RTR_FLAG
+            )
+            if is_for_it and not self._faults.is_deaf(joint):
+                node.receive(can_id, data)
+
+    @property
+    def _period(self) -> int:
+        """Number of the present period of 1 ms since power-on."""
+        return self._arm.time_ns // 1_000_000
+
+    # --- time ---------------------------------------------------------------------------------
 
     def advance_period(self) -> None:
         """Advance by 1 ms: two current-loop periods.
@@ -176,13 +235,16 @@ class Emulator:
 
     def _run_current_loop(self) -> None:
         """Advance by 500 us, and tick the nodes if that completes a period."""
-        servos, arm = self._servos, self._arm
-        tau_Nm = [servo.drive() for servo in servos]
+        servos, arm, faults = self._servos, self._arm, self._faults
+        tau_Nm = [servo.drive() for servo in servos] if faults.is_quiet else faults.drive()
         if self._is_waiting and any(servo.is_energised for servo in servos):
             self._is_waiting = False
             arm.release()
+            faults.start_schedule(self._period)
         arm.step(tau_Nm, CURRENT_LOOP_PERIOD_S)
         self._sense()
+        if not faults.is_quiet:
+            faults.distort()
         first = self._first_half_Nm
         if first is None:
             self._first_half_Nm = tau_Nm
@@ -191,6 +253,10 @@ class Emulator:
         self.tau_applied_Nm = [0.5 * (a + b) for a, b in zip(first, tau_Nm, strict=True)]
         for node in self._nodes:
             node.tick(TICK_S)
+        if not faults.is_idle:
+            faults.end_period(self._period)
+            if not self.is_lockstep:
+                faults.begin_period(is_lockstep=False)
         if not self.is_lockstep:
             self._begin_period()
 
@@ -214,3 +280,7 @@ class Emulator:
     def _latch_truth(self) -> None:
         # The arm makes new lists at every step, so these stay what they are.
         self.q_true_rad, self.dq_true_rad_s = self._arm.q_rad, self._arm.dq_rad_s
+
+
+def _lose(_frame: bytes) -> None:
+    """Take what nobody waits for."""

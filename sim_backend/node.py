@@ -41,6 +41,10 @@ class AmplifierNode(ABC):
     def tick(self, dt_s: float) -> None:
         """Advance the node's timers (heartbeat, watchdogs) by `dt_s` of emulated time."""
 
+    def fail_power_stage(self) -> None:
+        """Take torque off for a fault of the amplifier's own, and report it as the family does."""
+        self.servo.is_energised = False
+
     def begin_period(self) -> None:  # noqa: B027 - most families answer SYNC instead
         """Send the cyclic messages that are due now.
 

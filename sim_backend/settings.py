@@ -4,6 +4,8 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from drivers.fault_frame import DURATION_MAX_S, FaultKind, FaultOrder, FaultTarget
+
 
 class _Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -183,6 +185,42 @@ class WireSettings(_Settings):
     window_s: float = Field(1.0, gt=0, description="the bus load is reported over so long")
 
 
+class ScheduledFault(_Settings):
+    """A fault that comes by itself at a set time (`sim_backend.faults` says what each does)."""
+
+    target: Literal["encoder", "amplifier", "bus", "host"]
+    kind: Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent"]
+    joint: int = Field(0, ge=0, le=255, description="1 is the shoulder, 0 all; not of bus and host")
+    start_s: float = Field(ge=0, description="since the arm was let go, in whole ms")
+    duration_s: float | None = Field(
+        None, ge=1e-3, le=DURATION_MAX_S, description="left out, until a fault `ok`"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.joint and self.target in ("bus", "host"):
+            raise ValueError(f"the {self.target} belongs to no joint; leave joint out")
+        return self
+
+    def order(self) -> FaultOrder:
+        """Return what a fault frame would say."""
+        target, kind = FaultTarget[self.target.upper()], FaultKind[self.kind.upper()]
+        return FaultOrder(target, kind, self.joint, round((self.duration_s or 0.0) * 1e3))
+
+
+class FaultSettings(_Settings):
+    """Sizes of the emulator's faults, and those that come by themselves."""
+
+    schedule: tuple[ScheduledFault, ...] = ()
+    seed: int = Field(1, ge=0, description="of the generator of garbage")
+    shift_rad: float = Field(0.25, description="encoder `wrong`: it reads so much too much")
+    hold_ms: int = Field(
+        20, ge=1, le=1000, description="encoder and amplifier `slow`, encoder `delayed`"
+    )
+    interrupt_ms: int = Field(10, ge=1, description="`intermittent`: so long without ...")
+    interrupt_every_ms: int = Field(100, ge=2, description="... so often")
+
+
 class EmulatorSettings(_Settings):
     """How emulated time runs."""
 
@@ -201,6 +239,7 @@ class EmulatorSettings(_Settings):
         "delay and 0.5 ms lag",
     )
     wire: WireSettings = Field(WireSettings(), description="the wire model, off by default")
+    faults: FaultSettings = Field(FaultSettings(), description="none by default")
 
 
 def _require_order(start: str, start_s: float, end: str, end_s: float | None) -> None:

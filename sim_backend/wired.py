@@ -36,6 +36,10 @@ class WiredNode(AmplifierNode):
         if not self._controller.is_bus_off:
             self._receive(can_id, data)
 
+    def fail_power_stage(self) -> None:
+        """See `AmplifierNode.fail_power_stage`."""
+        self.node.fail_power_stage()
+
     def tick(self, dt_s: float) -> None:
         """See `AmplifierNode.tick`."""
         self.node.tick(dt_s)

@@ -67,12 +67,13 @@ class Cia402Axis(Axis):
         self._refuse_if_enabled(sdo)
         self._boot(port)
         name = self._read_name(sdo)
-        is_lockstep = self._is_lockstep(sdo)
+        is_emulated, is_lockstep = self._time_base(sdo)
         self._check_scales(sdo)
         self._write_profile(sdo)
         self._map_pdos(sdo)
         s = self._settings
-        return AxisInfo(name, s.rated_torque_Nm / 1000.0, math.tau / s.counts_per_turn, is_lockstep)
+        torque_Nm, angle_rad = s.rated_torque_Nm / 1000.0, math.tau / s.counts_per_turn
+        return AxisInfo(name, torque_Nm, angle_rad, is_lockstep, is_emulated)
 
     def start(self, port: Port) -> None:
         """Switch the node to OPERATIONAL."""
@@ -122,13 +123,14 @@ class Cia402Axis(Axis):
             return "unnamed"
 
     @staticmethod
-    def _is_lockstep(sdo: SdoClient) -> bool:
+    def _time_base(sdo: SdoClient) -> tuple[bool, bool]:
+        """Return whether the drive is emulated, and whether it runs in lockstep."""
         try:
             if sdo.read_number(codec.U32, Index.IDENTITY, 2) != HIL_PRODUCT_CODE:
-                return False
+                return False, False
         except SdoRefusedError:
-            return False
-        return sdo.read_number(codec.U8, Index.TIME_BASE) == 1
+            return False, False
+        return True, sdo.read_number(codec.U8, Index.TIME_BASE) == 1
 
     def _check_scales(self, sdo: SdoClient) -> None:
         s = self._settings

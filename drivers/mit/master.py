@@ -100,7 +100,8 @@ class MitAxis(Axis):
 
     def _info(self, name: str, *, is_lockstep: bool) -> AxisInfo:
         s = self._settings
-        return AxisInfo(name, s.torque_resolution_Nm, s.angle_resolution_rad, is_lockstep)
+        steps = s.torque_resolution_Nm, s.angle_resolution_rad
+        return AxisInfo(name, *steps, is_lockstep, self._is_emulated)
 
     def _ask(self, port: Port, can_id: int, data: bytes, reply_id: int) -> bytes:
         """Send a frame and return the data of the answer.

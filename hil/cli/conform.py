@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from time import monotonic_ns, time_ns
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 from drivers.arm_bus import SENT, ArmBus
 from drivers.bus import open_bus
@@ -43,6 +43,7 @@ AnyAxis = TypeVar("AnyAxis", bound=AxisSettings)
 _WATCHDOG_SETTINGS = ("rpdo_timeout_ms", "watchdog_ms")
 _REPORT_SETTINGS = ("torque_report_ms", "heartbeat_ms")
 """Families that do not answer SYNC may report torque and state this rarely."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 FRAMES_SHOWN = 40
 FRAMES_SHOWN_OF_FAILURE = 8
 
@@ -124,14 +125,22 @@ def run(options: argparse.Namespace) -> int:
     )
     printer = _Printer(options, _decoder(config))
     with ExitStack() as stack:
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-        stack.callback(signal.signal, signal.SIGTERM, before)
+        for number in _SIGNALS:
+            stack.callback(signal.signal, number, signal.signal(number, _interrupt))
         writer = stack.enter_context(FrameLogWriter(options.log)) if options.log else None
         bus = ArmBus(open_bus(config.bus.address), [axis], now_ns=monotonic_ns)
         stack.callback(bus.close)
         bench = Bench(bus, limits, timing)
         results = run_steps(bench, STEPS, lambda result: printer.show(result, writer))
     return printer.end(results)
+
+
+def _interrupt(number: int, frame: object) -> NoReturn:
+    """End the run; nothing interrupts taking torque off."""
+    del number, frame
+    for each in _SIGNALS:
+        signal.signal(each, signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 # --- what is asked for --------------------------------------------------------------------------

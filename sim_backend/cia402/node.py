@@ -131,6 +131,10 @@ class Cia402Node(AmplifierNode):
         if handler is not None:
             handler(data)
 
+    def fail_power_stage(self) -> None:
+        """See `AmplifierNode.fail_power_stage`: FAULT, EMCY 5001h."""
+        self._inject_fault(1)
+
     def tick(self, dt_s: float) -> None:
         """See `AmplifierNode.tick`. A deadline is never judged later than it is due."""
         if self.nmt_state is NmtState.INITIALISING:

@@ -70,6 +70,10 @@ class DamiaoNode(MitNode):
         """As the reply's first byte says it."""
         return self.fault or int(self.is_enabled)
 
+    def fail_power_stage(self) -> None:
+        """See `AmplifierNode.fail_power_stage`."""
+        self.fail(INJECTED_FAULT)
+
     def lose_master(self) -> None:
         """Switch off with fault D; FB ends it, and then the motor is disabled."""
         self.fail(DamiaoStatus.LOST_COMMUNICATION)

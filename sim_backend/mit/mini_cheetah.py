@@ -20,6 +20,10 @@ class MiniCheetahNode(MitNode):
     def _is_short(self) -> bool:
         return self.settings.variant == "tmotor"
 
+    def fail_power_stage(self) -> None:
+        """See `AmplifierNode.fail_power_stage`."""
+        self.fail(INJECTED_FAULT)
+
     def lose_master(self) -> None:
         """Zero torque, power stays on."""
         self.setpoint = self.setpoint._replace(kp_Nm_rad=0.0, kd_Nms_rad=0.0, torque_Nm=0.0)

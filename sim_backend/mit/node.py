@@ -129,6 +129,10 @@ class MitNode(AmplifierNode):
         self.disable()
 
     @abstractmethod
+    def fail_power_stage(self) -> None:
+        """See `AmplifierNode.fail_power_stage`, with a fault number of the variant."""
+
+    @abstractmethod
     def lose_master(self) -> None:
         """React to the command watchdog."""
 

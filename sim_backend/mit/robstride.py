@@ -66,6 +66,10 @@ class RobStrideNode(MitNode):
         is_lockstep = self.settings.is_lockstep
         return codec.HIL_UNIQUE_LOCKSTEP if is_lockstep else codec.HIL_UNIQUE_WALL
 
+    def fail_power_stage(self) -> None:
+        """See `AmplifierNode.fail_power_stage`."""
+        self.fail(INJECTED_FAULT)
+
     def lose_master(self) -> None:
         """Go to reset mode."""
         self.disable()

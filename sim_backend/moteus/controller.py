@@ -204,7 +204,8 @@ class Controller:
             self.control_torque_Nm = self._position_torque_Nm()
         elif mode == Mode.CURRENT:
             current_A = _finite(self.command.q_current_A)
-            self.control_torque_Nm = current_A * servo.settings.torque_constant_Nm_A
+            wanted_Nm = current_A * servo.settings.torque_constant_Nm_A
+            self.control_torque_Nm = _clip(wanted_Nm, servo.torque_max_Nm)
         elif mode in (Mode.ZERO_VELOCITY, Mode.BRAKE):
             self.control_torque_Nm = self._damping_torque_Nm(mode)
         else:
@@ -244,15 +245,19 @@ class Controller:
         )
 
     def _damping_torque_Nm(self, mode: int) -> float:
-        if mode == Mode.BRAKE:
+        limit_Nm = self.servo.torque_max_Nm
+        if mode == Mode.BRAKE:  # what the shorted windings' current makes
             settings = self.servo.settings
             gain = settings.torque_constant_Nm_A**2 / settings.resistance_ohm
-            return -gain * self.servo.dq_rad_s
-        wanted = _finite(-self.configuration["servo.pid_position.kd"] * self.velocity_rev_s())
-        limit = self.servo.torque_max_Nm
+            return _clip(-gain * self.servo.dq_rad_s, limit_Nm)
+        wanted_Nm = _finite(-self.configuration["servo.pid_position.kd"] * self.velocity_rev_s())
         if self.mode == Mode.TIMEOUT:
-            limit = min(limit, self.configuration["servo.timeout_max_torque_Nm"])
-        return max(-limit, min(limit, wanted))
+            limit_Nm = min(limit_Nm, abs(self.configuration["servo.timeout_max_torque_Nm"]))
+        return _clip(wanted_Nm, limit_Nm)
+
+
+def _clip(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))
 
 
 def _finite(value: float) -> float:

@@ -57,6 +57,8 @@ _TORQUE_AT, _TORQUE_END = len(_TORQUE_HEAD), len(_TORQUE_HEAD) + 4
 _KNOWN_TAILS_MAX = 8
 _SOURCE_MASK = 0x7F
 _FAULT_MAX = 127
+DRIVER_FAULT = 33
+"""Fault code of the motor driver chip."""
 _INT32_ONLY = frozenset((*range(0x100, 0x103), *range(0x120, 0x123), *range(0x150, 0x154)))
 _WRITE_ONLY = frozenset((Register.REQUIRE_REINDEX, Register.RECAPTURE, *range(0x154, 0x158)))
 _FIELDS: dict[int, str] = {
@@ -193,6 +195,10 @@ class MoteusNode(AmplifierNode):
                 return
         if source & codec.WANTS_REPLY:
             self._send(source & _SOURCE_MASK, reply)
+
+    def fail_power_stage(self) -> None:
+        """See `AmplifierNode.fail_power_stage`: mode FAULT, motor driver fault."""
+        self.controller.fail(DRIVER_FAULT)
 
     def tick(self, dt_s: float) -> None:
         """See `AmplifierNode.tick`."""

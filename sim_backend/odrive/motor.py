@@ -93,10 +93,9 @@ class Controller:
         self._integral_Nm = 0.0
 
     def restart(self, position_rev: float) -> None:
-        """Enter closed loop control where the motor is."""
+        """Enter closed loop control where the motor is; velocity and torque inputs stay."""
         self._integral_Nm = 0.0
         self.input_pos_rev = position_rev
-        self.input_vel_rev_s = 0.0
 
     def is_overspeed(self, velocity_rev_s: float) -> bool:
         """Tell whether the velocity is beyond its limit and tolerance."""

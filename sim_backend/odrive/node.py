@@ -117,6 +117,10 @@ class OdriveNode(AmplifierNode):
         if self._is_due(Endpoint.TORQUES_RATE):
             self._tell(Command.TORQUES)
 
+    def fail_power_stage(self) -> None:
+        """See `AmplifierNode.fail_power_stage`: disarmed, DRV_FAULT."""
+        self.axis.fail(AxisError.DRV_FAULT)
+
     def begin_period(self) -> None:
         """Send the encoder estimates when they are due."""
         if self._is_on and self._is_due(Endpoint.ENCODER_RATE):

@@ -73,7 +73,7 @@ def test_configure__emulated__named_with_resolutions_and_watchdog_set(rig):
     assert "48494C31" in info.name
     assert info.is_lockstep
     assert info.angle_resolution_rad == pytest.approx(math.tau / 4096)
-    assert info.torque_resolution_Nm == pytest.approx(15.0 * 2**-23, rel=0.1)
+    assert info.torque_resolution_Nm == 2.0**-20  # of a float32 between 8 and 16
     for node in rig.nodes:
         assert node.controller.configuration["servo.timeout_mode"] == Mode.STOPPED
         assert node.controller.configuration["servo.default_timeout_s"] == pytest.approx(0.02)
@@ -143,14 +143,14 @@ def test_configure__in_fault__taken_and_told_as_a_fault(rig):
 def test_configure__firmware_without_the_registers__refused():
     rig = rig_of()
     rig.nodes[0]._accepted.pop(Register.COMMAND_ILIMIT_SCALE)
-    with pytest.raises(AmplifierError, match="knows no register 0x02B .* update its firmware"):
+    with pytest.raises(AmplifierError, match=r"knows no register 0x02B .* update its firmware"):
         rig.configure()
 
 
 def test_configure__console_without_the_value__refused():
     rig = rig_of()
     del rig.nodes[0].controller.configuration["servo.timeout_mode"]
-    with pytest.raises(AmplifierError, match=r"`conf set servo.timeout_mode 0` answers 'ERR"):
+    with pytest.raises(AmplifierError, match=r"`conf set servo.timeout_mode` answers 'ERR"):
         rig.configure()
 
 
@@ -430,6 +430,7 @@ def test_handlers__random_and_mutated_frames__no_exception_and_legal(alone, say)
     good = [state(), state(mode=0, fault=0), state(mode=1, fault=33), state(torque=math.nan),
             codec.pack_values(REPLY, 0, INT32, 10, 1, 2, 3)]  # fmt: skip
     take = axis.handlers()[ONE]
+    alone.cycle(mode=0)
     for _ in range(FUZZ_FRAMES):
         data = babble(chance, good)
         fits = len(data) <= 8 and chance.random() < 0.5

@@ -4,6 +4,7 @@ The nodes are emulated ones on a real hub, served by a thread; the bad ones are 
 """
 
 import json
+import signal
 import tempfile
 import threading
 from contextlib import contextmanager
@@ -402,13 +403,14 @@ def test_conform__json__machine_readable(running, tmp_path):
     assert [step["step"] for step in found["steps"]] == NAMES
 
 
-def test_conform__interrupted__torque_is_off(running, tmp_path):
-    """SIGTERM while the drive is under power: the drive is disabled before the process ends."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_conform__interrupted__torque_is_off(running, tmp_path, number):
+    """While the drive is under power: it is disabled before the process ends."""
     process = HilProcess(
         tmp_path, "conform", "cia402", "--bus", running.address,
         "--set", "emulator.stall_timeout_s=5",
     )  # fmt: skip
     wait_until(lambda: "pass         enable " in process.stdout, what="the enabled drive")
-    process.end()
+    process.end(number)
     assert process.process.returncode == 130
     assert not running.node.drive.machine.is_powered

@@ -242,8 +242,10 @@ def test_python_can__its_own_socketcan_interface__exchanges_frames_with_ours(own
 
 
 def test_candump_and_cansend__frames_of_each_kind__agree_on_every_byte(can_lab):
-    with SocketCanBus(can_lab.interface) as ours:
-        dump = can_lab.tool("candump", "-L", can_lab.interface)
+    with (
+        SocketCanBus(can_lab.interface) as ours,
+        can_lab.tool("candump", "-L", can_lab.interface) as dump,
+    ):
         lines = ["080#", "181#0102030405060708", "12345678#FF", "701#R", "7FF#00"]
 
         def is_listening():

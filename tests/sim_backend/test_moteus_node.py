@@ -270,10 +270,10 @@ def test_torque_frame__answered_quickly_or_slowly__the_same(tau_Nm, max_Nm, time
             bench.send(torque_frame(tau, parts))
             bench.ticks(1)
     assert quick.sent == slow.sent
-    fields = [
-        [getattr(b.node.controller.command, name) for name in _COMMAND] for b in (quick, slow)
-    ]
-    assert fields[0] == pytest.approx(fields[1], nan_ok=True)
+    commands = [bench.node.controller.command for bench in (quick, slow)]
+    for name in _COMMAND:
+        first, second = (getattr(command, name) for command in commands)
+        assert first == pytest.approx(second, nan_ok=True)
     assert quick.servo.torque_target_Nm == pytest.approx(slow.servo.torque_target_Nm, nan_ok=True)
 
 
@@ -406,13 +406,9 @@ def test_receive__random_and_mutated_frames__no_exception_and_torque_within_limi
         servo.sense(chance.uniform(-9.0, 9.0), chance.uniform(-30.0, 30.0))
         bench.send(babble(chance, good))
         bench.ticks(chance.randrange(4))
-        servo.drive()
         assert drive.mode in (0, 1, 2, 3, 9, 10, 11, 12, 15)
-        powered = drive.mode in (9, 10, 12, 15) or drive.mode == Mode.TIMEOUT
-        assert not servo.is_energised or powered
-        assert abs(servo.current_A) <= servo.settings.current_max_A * 1.5
-        if drive.mode == Mode.POSITION:
-            assert abs(servo.torque_target_Nm) <= servo.torque_max_Nm
+        assert not servo.is_energised or drive.mode in (9, 10, 11, 12, 15)
+        assert abs(servo.torque_target_Nm) <= servo.torque_max_Nm
         assert servo.is_energised or servo.torque_target_Nm == 0.0
         assert all(len(data) <= 64 for _, data in bench.sent)
         if drive.mode == Mode.FAULT and chance.random() < 0.5:

@@ -97,7 +97,6 @@ def test_odrive_can__torque_control__closed_loop_iq_and_motion(arm, axis_id):
     servo = arm.servos[axis_id]
 
     async def actions(client):
-        assert client.axis_state == "IDLE"
         await enable_torque(client)
         client.set_input_torque(0.25)
         await until(lambda: servo.current_A * servo.settings.torque_constant_Nm_A > 0.45)
@@ -106,6 +105,7 @@ def test_odrive_can__torque_control__closed_loop_iq_and_motion(arm, axis_id):
         assert iq["Iq_Setpoint"] == pytest.approx(wanted_A, rel=1e-3)
         assert iq["Iq_Measured"] == pytest.approx(wanted_A, rel=0.1)
         await until(lambda: servo.q_rad > 0.1)
+        client.set_input_torque(0.0)
         estimates = await client.get_encoder_estimates()
         assert estimates["Vel_Estimate"] > 0.0
         turns = 2.0 * servo.q_rad / math.tau
@@ -200,10 +200,11 @@ class Flow:
         raise AssertionError(f"no 0x{command:02X} of node {node}")
 
     def wait_for_state(self, node, wanted):
-        while True:
+        for _ in range(20):
             error, state, _, _ = struct.unpack("<IBBB", self.wait(node, 0x01)[:7])
-            if state == wanted:
-                return error
+            if (error, state) == (0, wanted):
+                return
+        raise AssertionError(f"state {state}, error {error:08X}")
 
     def scan(self, count):
         """Serial number -> node, of so many drives, as can_enumerate.py asks for them."""
@@ -243,16 +244,17 @@ def test_can_enumerate__scan_assign_and_identify__nodes_by_serial_number(arm, fl
 
 
 def test_can_simple__closed_loop_then_set_points__feedback_arrives(arm, flow):
+    flow.wait_for_state(1, 1)  # it has been switched on just now
     flow.send(1, 0x0B, struct.pack("<II", 2, 1))
     flow.send(1, 0x07, struct.pack("<I", 8))
-    assert flow.wait_for_state(1, 8) == 0
+    flow.wait_for_state(1, 8)
     for _ in range(5):
         flow.send(1, 0x0D, struct.pack("<ff", 0.5, 0.0))
         position, velocity = struct.unpack("<ff", flow.wait(1, 0x09))
         assert math.isfinite(position + velocity)
     assert arm.servos[1].is_energised
     flow.send(1, 0x07, struct.pack("<I", 1))
-    assert flow.wait_for_state(1, 1) == 0
+    flow.wait_for_state(1, 1)
 
 
 def test_can_param_access__version_write_read__by_endpoint_number(flow):
