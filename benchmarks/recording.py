@@ -62,8 +62,7 @@ def _per_sample(samples: Samples) -> Samples:
 
 
 def _values(layout: SampleLayout) -> Values:
-    scalars = tuple(float(i) if i == len(layout.scalar_names) - 1 else i
-                    for i in range(len(layout.scalar_names)))  # fmt: skip
+    scalars = tuple(range(len(layout.scalar_names)))
     lists = [[0.1 + i, -0.2 - i] for i in range(len(layout.list_names))]
     return scalars, lists
 

@@ -63,8 +63,15 @@ class TorqueLimiter:
         return sent
 
 
+SOFT_SLACK_RAD = 0.02
+"""An arm outside its soft limit may be so much further out than it was at its innermost."""
+
+
 class MotionGuard:
     """Watches the measured motion of all joints.
+
+    An arm that gets power outside its soft limit, and within the hard one, may be driven back: it
+    trips when it moves further out, and the way back is shut behind it.
 
     Attributes:
         joint: Joint (from 1) of the last violation.
@@ -72,7 +79,7 @@ class MotionGuard:
         limit: What it exceeded.
     """
 
-    __slots__ = ("_joints", "joint", "limit", "value")
+    __slots__ = ("_admitted", "_joints", "_soft", "joint", "limit", "value")
 
     def __init__(self, settings: LimitSettings) -> None:
         margin = settings.hard_margin_rad
@@ -88,7 +95,29 @@ class MotionGuard:
                 )
             )
         ]
+        self._soft = list(zip(settings.q_min_rad, settings.q_max_rad, strict=True))
+        self._admitted = list(self._soft)
         self.joint, self.value, self.limit = 0, 0.0, 0.0
+
+    def admit(self, q_rad: Sequence[float]) -> None:
+        """Power comes on here: from outside the soft limits there is only the way back."""
+        self._admitted = [
+            (min(low, q - SOFT_SLACK_RAD), max(high, q + SOFT_SLACK_RAD))
+            if not low <= q <= high
+            else (low, high)
+            for q, (low, high) in zip(q_rad, self._soft, strict=True)
+        ]
+
+    def _is_on_way_back(self, joint: int, q_rad: float) -> bool:
+        """Tell whether a joint outside its soft limit is no further out; narrow what is left."""
+        (low, high), (soft_low, soft_high) = self._admitted[joint], self._soft[joint]
+        if not low <= q_rad <= high:
+            return False
+        if q_rad > soft_high:
+            self._admitted[joint] = soft_low, min(high, q_rad + SOFT_SLACK_RAD)
+        else:
+            self._admitted[joint] = max(low, q_rad - SOFT_SLACK_RAD), soft_high
+        return True
 
     def check(
         self, q_rad: Sequence[float], dq_rad_s: Sequence[float], q_des_rad: Sequence[float]
@@ -108,6 +137,8 @@ class MotionGuard:
             elif abs(dq) > dq_max:
                 code, value, limit = FaultCode.VELOCITY, dq, dq_max
             elif not low <= q <= high:
+                if -following <= error <= following and self._is_on_way_back(j, q):
+                    continue
                 code, value, limit = FaultCode.POSITION_SOFT, q, high if q > high else low
             if worst is FaultCode.NONE or code < worst:
                 worst, self.joint, self.value, self.limit = code, j + 1, value, limit

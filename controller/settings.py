@@ -194,6 +194,12 @@ class LimitSettings(_Settings):
     stop_timeout_s: float = Field(
         2.0, gt=0, description="a damped stop ends after this at the latest"
     )
+    lowering_rad_s: float = Field(
+        0.4, gt=0, description="a stop lets a vertical arm down at this rate (controller.model)"
+    )
+    lowering_timeout_s: float = Field(
+        10.0, gt=0, description="stop_timeout_s of an arm that gravity pulls"
+    )
 
     @model_validator(mode="after")
     def _check_signs(self) -> Self:
@@ -218,6 +224,17 @@ class ControllerSettings(_Settings):
     model: ModelSettings | None = Field(None, description="of the arm, for the model-based laws")
     slotine_li: SlotineLiSettings = SlotineLiSettings()
     monitor: MonitorSettings = MonitorSettings()
+
+    @property
+    def is_lowered(self) -> bool:
+        """A stop lets the arm down: its model says that gravity pulls it."""
+        return self.model is not None and self.model.gravity_m_s2 > 0.0
+
+    @property
+    def stop_time_s(self) -> float:
+        """Time after which a damped stop is over at the latest."""
+        limits = self.limits
+        return limits.lowering_timeout_s if self.is_lowered else limits.stop_timeout_s
 
     def warnings(self) -> list[str]:
         """Say what is allowed and not advised, one line each."""

@@ -43,6 +43,11 @@ class ArmBus:
         late_frames: Feedback that arrived after its cycle had ended; discarded.
         unknown_frames: Frames that belong to no axis of this arm.
         error_frames: Error reports of the CAN controller.
+
+    An answer that comes a whole period late looks like one in time. After a gap, therefore, one
+    cycle goes by without a request (a probe): whoever answers in it answers an older one. Until a
+    probe passes in silence, the answers of the amplifiers that are asked count as missing, and as
+    `late_frames`.
     """
 
     def __init__(
@@ -57,6 +62,12 @@ class ArmBus:
         self._now_ns = now_ns
         self._log: FrameLog | None = None
         self._is_flooded = False
+        self._is_emulated = False
+        self._has_gap = False
+        self._is_probing = False
+        self._is_suspect = False
+        self._tick = pack_frame(LOCKSTEP_ID)
+        self._asked = [a for a in axes if a.uses_sync or type(a).request is not Axis.request]
         self._handlers: dict[int, FrameHandler] = {}
         self._shared_ids: frozenset[int] = frozenset()
         self._sync = pack_frame(SYNC_ID) if any(a.uses_sync for a in axes) else None
@@ -90,6 +101,7 @@ class ArmBus:
         infos = [axis.configure(port) for axis in self.axes]
         if len({info.is_lockstep for info in infos}) > 1:
             raise AmplifierError("some axes run in lockstep and some by the clock; choose one")
+        self._is_emulated = all(info.is_emulated for info in infos)
         if self._sync is None and infos[0].is_lockstep:
             self._sync = pack_frame(LOCKSTEP_ID)
         for axis in self.axes:
@@ -116,6 +128,9 @@ class ArmBus:
     def request_feedback(self) -> None:
         """Begin a cycle: discard what came too late for the last one, then ask, SYNC last."""
         self._drain()
+        if self._is_probing:
+            self._begin_probe()
+            return
         for axis in self._requesting:
             request = axis.request()
             if request is not None:
@@ -142,6 +157,8 @@ class ArmBus:
                 missing += 1
         if self._is_flooded:
             return False
+        if self._is_probing:
+            return self._probe(deadline_ns)
         overdue = 0
         recv, handlers, log = self._bus.recv, self._handlers, self._log
         while missing:
@@ -161,7 +178,47 @@ class ArmBus:
                 self._count_foreign(frame)
             elif handler(frame):
                 missing -= 1
-        return missing == 0
+        if missing:
+            self._has_gap = True
+            return False
+        return not (self._has_gap or self._is_suspect) or self._judge_answers()
+
+    # --- answers that come too late -----------------------------------------------------------
+
+    def _judge_answers(self) -> bool:
+        """All have answered, after a gap: have it proved; the first time they are believed."""
+        self._is_probing = bool(self._asked)
+        self._has_gap = False
+        if self._is_suspect:
+            self._disbelieve()
+        return not self._is_suspect
+
+    def _disbelieve(self) -> None:
+        for axis, age in zip(self._asked, self._ages, strict=True):
+            axis.age_cycles = age + 1
+            self.late_frames += 1
+        self._ages = [axis.age_cycles for axis in self._asked]
+
+    def _begin_probe(self) -> None:
+        """Begin a cycle without asking; emulated time goes on all the same."""
+        if self._is_lockstep:
+            self._send(self._tick)
+        if self._log is not None:
+            self._log(MARK, NO_FRAME)
+
+    def _probe(self, deadline_ns: int) -> bool:
+        """Listen until the deadline: an answer now was asked for a period ago, or earlier."""
+        self._is_probing = False
+        asked = self._asked
+        ages = [axis.age_cycles for axis in asked]
+        self._receive_until(deadline_ns)
+        late = [axis for axis, age in zip(asked, ages, strict=True) if axis.age_cycles < age]
+        self._is_suspect = bool(late)
+        self.late_frames += len(late)
+        for axis, age in zip(asked, ages, strict=True):
+            axis.age_cycles = age
+        self._ages = ages
+        return not asked
 
     def send_torques(self, tau_Nm: Sequence[float]) -> None:
         """End a cycle: send every axis its command, and the heartbeat when it is due.
@@ -191,6 +248,12 @@ class ArmBus:
             return False
         self._extra.append(frame)
         return True
+
+    def send_fault(self, frame: bytes) -> bool:
+        """Queue a frame for the emulator (`drivers.fault_frame`); False if amplifiers are real."""
+        if self._is_emulated:
+            self._extra.append(frame)
+        return self._is_emulated
 
     @property
     def is_enabled(self) -> bool:

@@ -135,6 +135,12 @@ class Axis(ABC):
     def reset_fault(self) -> None:
         """Ask the amplifier to leave its fault state; it stays disabled."""
 
+    def recount(self) -> None:  # noqa: B027 - families whose drives count turns have nothing to do
+        """Forget turns that were counted from readings no joint can make; a reset calls it.
+
+        The angle is then as at start-up, within half a turn of zero.
+        """
+
     @abstractmethod
     def end_cycle(self) -> None:
         """Count this cycle in the axis's own watchdogs."""

@@ -93,10 +93,26 @@ class ZenohSettings(_Settings):
 
 
 class RecordingSettings(_Settings):
-    """Where runs are recorded."""
+    """Where runs are recorded, and how much of the disk they may take."""
 
     directory: str = "runs"
     is_enabled: bool = True
+    max_size_MB: float = Field(1000.0, gt=0, description="10^6 bytes; then a new file begins")
+    max_age_s: float = Field(3600.0, gt=0, description="likewise")
+    disk_budget_MB: float | None = Field(
+        None, gt=0, description="of all of the arm's recordings; the oldest are removed; none = all"
+    )
+    min_free_MB: float = Field(200.0, ge=0, description="less free space ends the recording")
+
+    @model_validator(mode="after")
+    def _check_budget(self) -> Self:
+        budget, size = self.disk_budget_MB, self.max_size_MB
+        if budget is not None and budget < 2 * size:
+            raise ValueError(
+                f"disk_budget_MB {budget:g} must be at least twice max_size_MB {size:g}: "
+                "raise the budget or lower the size of a file"
+            )
+        return self
 
 
 class Config(BaseSettings):

@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from controller.errors import CommandError
-from controller.faults import FaultCode, Reaction
+from controller.faults import REACTIONS, FaultCode, Reaction
+from controller.gravity import GravityLoad
 from controller.limits import MotionGuard, TorqueLimiter
 from controller.machine import Machine, State, Trigger
 from controller.monitor import Monitor
@@ -17,10 +18,13 @@ from controller.registry import make_law
 from controller.velocity import VelocityEstimator, make_estimator
 from drivers.axis import Axis, AxisStatus
 from drivers.errors import BusDownError, BusError
+from drivers.fault_frame import FaultKind, FaultOrder, FaultTarget, pack_fault
 from hil.config import Config, ConfigError
 
 AT_REST_RAD_S = 0.05
 """A damped stop ends when every joint is slower than this."""
+STOP_SPEED_RATIO, STOP_SPEED_MARGIN_RAD_S = 1.5, 1.0
+"""A stop that makes the arm this much faster than it was does not damp: torque goes off."""
 
 EventSink = Callable[[str, Mapping[str, Any]], None]
 """Takes an event's kind and its details."""
@@ -50,8 +54,8 @@ class ArmLink(Protocol):
     def send_torques(self, tau_Nm: Sequence[float]) -> None:
         """End a cycle."""
 
-    def inject_fault(self, joint: int) -> bool:
-        """Put an emulated amplifier into fault."""
+    def send_fault(self, frame: bytes) -> bool:
+        """Ask the emulator for a fault; False if the amplifiers are real."""
 
     def first_in(self, status: AxisStatus) -> Axis | None:
         """Return the first axis with this status."""
@@ -97,7 +101,11 @@ class Control:
         self._estimator = _make_estimator(config, bus)
         self._zeros = [0.0] * n
         self._enable_cycles = round(config.loop.enable_timeout_s / self._period_s)
-        self._stop_cycles = round(settings.limits.stop_timeout_s / self._period_s)
+        self._stop_cycles = round(settings.stop_time_s / self._period_s)
+        self._stop_speed_rad_s = 0.0
+        model = settings.model
+        is_lowered = model is not None and settings.is_lowered
+        self._gravity = GravityLoad(model, settings.limits) if model and is_lowered else None
         self._enabling_left = 0
         self._stopping_left = 0
         self._has_feedback = False
@@ -171,9 +179,10 @@ class Control:
             if state is State.STOPPING:
                 return self._damp()
             return self._control(periods)
-        if self._enabling_left and not self._age:
-            if self._power_on():
+        if self._enabling_left:
+            if not self._age and self._power_on():
                 return self._control(periods)
+            self._await_power()
         elif not self._age:
             self.player.hold(self.q_rad)
         self._dt_s = 0.0
@@ -217,15 +226,43 @@ class Control:
     def _damp(self) -> list[float]:
         """Torque against the motion; power goes off at rest or after the time allowed."""
         self._stopping_left -= 1
-        is_at_rest = all(abs(dq) < AT_REST_RAD_S for dq in self.dq_rad_s)
         self.player.hold(self.q_rad)
-        if is_at_rest or self._stopping_left <= 0:
+        if self._has_stop_failed():
+            return self._rest()
+        gravity = self._gravity
+        load_Nm = self._zeros if gravity is None else gravity.torques_Nm(self.q_rad)
+        is_at_rest = all(abs(dq) < AT_REST_RAD_S for dq in self.dq_rad_s)
+        is_over = is_at_rest and (gravity is None or gravity.is_down(load_Nm))
+        if is_over or self._stopping_left <= 0:
             self.fire(Trigger.AT_REST)
             return self._rest()
         dt_s, self._dt_s = self._dt_s, 0.0
         damping = self._limits.damping_Nms_rad
-        self.tau_cmd_Nm = [-d * dq for d, dq in zip(damping, self.dq_rad_s, strict=True)]
+        if gravity is None:
+            self.tau_cmd_Nm = [-d * dq for d, dq in zip(damping, self.dq_rad_s, strict=True)]
+        else:
+            rates = gravity.lowering_rad_s(load_Nm)
+            terms = zip(load_Nm, damping, self.dq_rad_s, rates, strict=True)
+            self.tau_cmd_Nm = [load - d * (dq - rate) for load, d, dq, rate in terms]
         return self._limiter.step(self.tau_cmd_Nm, dt_s)
+
+    def _has_stop_failed(self) -> bool:
+        """Trip if the stop is none: a hard limit, a trip speed, or an arm that gets faster."""
+        if self._estimator is not None and not self._estimator.is_locked:
+            code = FaultCode.ESTIMATOR_LOST
+        else:
+            code = self._guard.check(self.q_rad, self.dq_rad_s, self.q_rad)
+        if REACTIONS[code] is Reaction.TORQUE_OFF:
+            self._trip(code, **self._explain(code))
+            return True
+        speed_rad_s = max(abs(dq) for dq in self.dq_rad_s)
+        if speed_rad_s <= self._stop_speed_rad_s:
+            return False
+        told = "the damped stop makes the arm faster; check the sign of the torque"
+        self._trip(
+            FaultCode.VELOCITY, value=speed_rad_s, limit=self._stop_speed_rad_s, detail=told
+        )
+        return True
 
     def _bridge_gap(self) -> list[float]:
         """Feedback is missing: hold the last torque, then damp, then give up."""
@@ -246,18 +283,28 @@ class Control:
     # --- power and faults -------------------------------------------------------------------
 
     def _power_on(self) -> bool:
-        self._enabling_left -= 1
         self.player.hold(self.q_rad)
         if self._bus.is_enabled:
             self._enabling_left = 0
+            self._guard.admit(self.q_rad)
             self.law.reset()
             self.monitor.reset()
             self.fire(Trigger.POWERED)
             return True
-        if self._enabling_left == 0:
-            waiting = next(a for a in self._bus.axes if a.status is not AxisStatus.ENABLED)
-            self._trip(FaultCode.ENABLE_TIMEOUT, detail=f"{waiting.label} is not enabled in time")
         return False
+
+    def _await_power(self) -> None:
+        """Count the cycles since `enable`, with or without feedback."""
+        self._enabling_left -= 1
+        if self._enabling_left == 0:
+            axes = self._bus.axes
+            waiting = next((a for a in axes if a.status is not AxisStatus.ENABLED), None)
+            silent = next((a for a in axes if a.age_cycles), None)
+            if waiting is not None:
+                detail = f"{waiting.label} is not enabled in time"
+            else:
+                detail = f"{silent.label if silent else 'an axis'}: no feedback in time"
+            self._trip(FaultCode.ENABLE_TIMEOUT, detail=detail)
 
     def _check_amplifiers(self) -> None:
         if self._bus.is_enabled:
@@ -303,6 +350,10 @@ class Control:
         self._events("state", {"from": before.name, "to": state.name})
         if state is State.STOPPING:
             self._stopping_left = self._stop_cycles
+            speed_rad_s = max(abs(dq) for dq in self.dq_rad_s)
+            if self._gravity is not None:
+                speed_rad_s = max(speed_rad_s, self._limits.lowering_rad_s)
+            self._stop_speed_rad_s = STOP_SPEED_RATIO * speed_rad_s + STOP_SPEED_MARGIN_RAD_S
         if not state.is_powered:
             self._enabling_left = 0
             self.player.hold(self.q_rad)
@@ -372,6 +423,8 @@ class Control:
         for axis in self._bus.axes:
             if axis.status in (AxisStatus.FAULT, AxisStatus.LOST):
                 axis.reset_fault()
+        for axis in self._bus.axes:
+            axis.recount()
         self._has_feedback = False  # whatever spoilt the estimate is forgotten
         self.fire(Trigger.RESET)
 
@@ -380,10 +433,29 @@ class Control:
         for gain, low, high in zip(self.law.gains, Kd_min, Kd_max, strict=True):
             gain.set_bounds(low, high)
 
-    def inject_fault(self, joint: int) -> None:
-        """Put the emulated amplifier of a joint (from 1) into fault."""
-        if not self._bus.inject_fault(joint - 1):
-            raise CommandError(f"the amplifier of joint {joint} has no fault injection")
+    def inject_fault(
+        self,
+        joint: int = 0,
+        target: str = "amplifier",
+        kind: str = "off",
+        duration_s: float | None = None,
+    ) -> None:
+        """Ask the emulator for a fault (`sim_backend.faults` says what each does).
+
+        Args:
+            joint: From 1; 0 is all.
+            target: `encoder`, `amplifier`, `bus` or `host`.
+            kind: `ok` ends the target's fault.
+            duration_s: None: until it is ended; `off` of an amplifier then happens once.
+        """
+        order = FaultOrder(
+            FaultTarget[target.upper()],
+            FaultKind[kind.upper()],
+            joint,
+            max(1, round(duration_s * 1e3)) if duration_s else 0,
+        )
+        if not self._bus.send_fault(pack_fault(order)):
+            raise CommandError("faults are for emulated amplifiers; these are real")
 
 
 def _make_estimator(config: Config, bus: ArmLink) -> VelocityEstimator | None:

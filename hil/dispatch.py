@@ -99,7 +99,7 @@ class Dispatcher:
         )
         self._patience_s = {
             "enable": shared.config.loop.enable_timeout_s + OUTCOME_TIMEOUT_S,
-            "disable": shared.config.controller.limits.stop_timeout_s + OUTCOME_TIMEOUT_S,
+            "disable": shared.config.controller.stop_time_s + OUTCOME_TIMEOUT_S,
             "estop": OUTCOME_TIMEOUT_S,
         }
         self._lock = threading.Lock()
@@ -225,17 +225,17 @@ class Dispatcher:
                 self._slot, self._samples = handed_over
 
     def _inject(self, request: FaultRequest) -> Reply:
-        if not (request.target == "amplifier" and request.kind == "off"):
-            raise Refusal(
-                f"fault {request.kind!r} on {request.target!r} is not available; "
-                "there is: kind 'off' on target 'amplifier'"
-            )
-        joints = [request.joint] if request.joint else list(range(1, self._config.joints + 1))
-        if max(joints) > self._config.joints:
-            reason = f"joint {max(joints)}: the arm has {self._config.joints} joints"
-            raise Refusal(reason, "joints", value=max(joints), limit=self._config.joints)
-        replies = [self._order("fault", joint=joint) for joint in joints]
-        return next((reply for reply in replies if not reply.ok), replies[0])
+        joint, joints = request.joint or 0, self._config.joints
+        if joint > joints:
+            reason = f"joint {joint}: the arm has {joints} joints"
+            raise Refusal(reason, "joints", value=joint, limit=joints)
+        return self._order(
+            "fault",
+            joint=joint,
+            target=request.target,
+            kind=request.kind,
+            duration_s=request.duration_s,
+        )
 
     # --- trajectories ------------------------------------------------------------------------
 

@@ -46,7 +46,7 @@ class Executor:
             "estop": self._estop,
             "reset": lambda _: control.reset(),
             "gain_bounds": lambda c: control.set_gain_bounds(c["Kd_min"], c["Kd_max"]),
-            "fault": lambda c: control.inject_fault(c["joint"]),
+            "fault": self._inject,
             "end": self._end,
             "supervisor_lost": self._lose_supervisor,
             "gateway_lost": self._lose_gateway,
@@ -92,6 +92,14 @@ class Executor:
     def _estop(self, _: Mapping[str, Any]) -> None:
         self._drop_pending("emergency stop")
         self._control.estop()
+
+    def _inject(self, command: Mapping[str, Any]) -> None:
+        self._control.inject_fault(
+            command["joint"],
+            command.get("target", "amplifier"),
+            command.get("kind", "off"),
+            command.get("duration_s"),
+        )
 
     def _end(self, _: Mapping[str, Any]) -> None:
         self.is_ending = True

@@ -106,6 +106,11 @@ class IdealArm:
         del joint
         return False
 
+    def send_fault(self, frame: bytes) -> bool:
+        """There is no bus to ask an emulator over."""
+        del frame
+        return False
+
     @property
     def is_enabled(self) -> bool:
         """True if every axis applies torque."""

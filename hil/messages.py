@@ -172,6 +172,12 @@ class FaultRequest(_Request):
         None, ge=1, le=MAX_JOINTS, strict=True, description="1 is the shoulder; none: every joint"
     )
     kind: Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent"]
+    duration_s: Real | None = Field(
+        None,
+        ge=1e-3,
+        le=MAX_DURATION_S,
+        description="emulated time, in whole ms; none: until it is ended by `ok`",
+    )
 
     @model_validator(mode="after")
     def _check_joint(self) -> Self:

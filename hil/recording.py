@@ -1,202 +1,34 @@
-"""Recordings: one MCAP file per run, Protobuf inside, readable after a kill.
-
-Channels `telemetry` (`hil.v1.Sample`, one message per sample), `bus` (`hil.v1.BusLog`, one
-message per drained batch) and `event` (`hil.v1.Event`); the references that were played are
-attachments, and the running configuration is the metadata record `config`. The file holds nothing
-but what was recorded (no wall-clock time, no host, no version), so that the same run written twice
-gives the same bytes.
-"""
+"""Recordings read back, as much of them as there is: a killed writer leaves a readable file."""
 
 import json
 import struct
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, Final, Self
 from zlib import crc32
 
 import numpy as np
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Metadata
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC, Writer
+from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
 from drivers.arm_bus import MARK
-from hil.errors import HilError
 from hil.fixed_protobuf import Records
 from hil.proto import telemetry_pb2
+from hil.recording_writer import CONFIG_NAME, Part, RecordingError, RecordingWriter
 from hil.telemetry import BusFrameLayout, LoggedFrame, SampleLayout, TelemetryError
 
-FLUSH_PERIOD_NS: Final = 100_000_000
-"""Recorded time after which a chunk is closed and handed to the kernel: what a kill can cost."""
-_CONFIG: Final = "config"
-_ROWS_NAME: Final = "trajectory-{:08x}.f64"
-_ROWS_TYPE: Final = "application/octet-stream"
+__all__ = ["Part", "RecordedEvent", "Recording", "RecordingError", "RecordingWriter"]
+
 _MOST_JOINTS: Final = 255  # more is a damaged file
 _BLOCK: Final = 4096  # samples decoded at a time
 _DAMAGE: Final = (McapError, ZstdError, struct.error, ValueError, RuntimeError, MemoryError)
 """What mcap's reader and its decompressors raise on a cut or damaged file."""
-
-
-class RecordingError(HilError):
-    """A recording could not be written, or a file is not a recording."""
-
-
-class RecordingWriter:
-    """Writes one recording. Not for the loop's process: a write can wait for the disk.
-
-    Args:
-        path: File to create; an existing one is replaced.
-        config: The running configuration as JSON text, or as what `json.dumps` takes.
-        joints: Of the arm.
-        with_truth: Samples carry the plant's truth.
-
-    Raises:
-        RecordingError: If the file cannot be created.
-    """
-
-    def __init__(
-        self, path: Path, config: Mapping[str, Any] | str, joints: int, with_truth: bool
-    ) -> None:
-        text = config if isinstance(config, str) else json.dumps(config, sort_keys=True)
-        self.path: Final = path
-        self._due_ns = 0
-        self._is_closed = False
-        try:
-            self._file = path.open("wb")
-        except OSError as error:
-            raise RecordingError(f"cannot create recording {path}: {error.strerror}") from error
-        self._writer: Any = Writer(self._file)  # untyped in part
-        self._writer.start(library="hil")
-        layout = {"json": text, "joints": str(joints), "with_truth": json.dumps(with_truth)}
-        self._writer.add_metadata(_CONFIG, layout)
-        self._telemetry = self._channel("telemetry", telemetry_pb2.Sample)
-        self._bus = self._channel("bus", telemetry_pb2.BusLog)
-        self._event = self._channel("event", telemetry_pb2.Event)
-        try:
-            self.flush()
-        except RecordingError:
-            self._is_closed = True
-            with suppress(OSError):  # closing tries to write once more
-                self._file.close()
-            raise
-
-    def _channel(self, topic: str, message: Any) -> int:  # noqa: ANN401 - generated class
-        files = FileDescriptorSet()
-        message.DESCRIPTOR.file.CopyToProto(files.file.add())
-        name = message.DESCRIPTOR.full_name
-        schema = self._writer.register_schema(name, "protobuf", files.SerializeToString())
-        return int(self._writer.register_channel(topic, "protobuf", schema))
-
-    def add_sample(self, t_ns: int, seq: int, payload: bytes) -> None:
-        """Add one serialised `hil.v1.Sample`.
-
-        Args:
-            t_ns: Its `t_ns`, the log time of the message.
-            seq: Its `seq`.
-            payload: The sample as the loop wrote it; not looked into.
-
-        Raises:
-            RecordingError: If the file cannot be written (disk full); what was written stays.
-        """
-        self._add(self._telemetry, t_ns, payload, seq)
-
-    def add_bus_log(self, t_ns: int, payload: bytes) -> None:
-        """Add one serialised `hil.v1.BusLog`; `t_ns` is the instant of its first frame.
-
-        Raises:
-            RecordingError: As for `add_sample`.
-        """
-        self._add(self._bus, t_ns, payload, 0)
-
-    def add_event(
-        self, t_ns: int, cycle: int, kind: str, detail: Mapping[str, Any] | str = "{}"
-    ) -> None:
-        """Add a state change, a fault, or a command and its outcome.
-
-        Args:
-            t_ns: Instant on the samples' clock.
-            cycle: Period number.
-            kind: What happened, one word.
-            detail: JSON object, as text or as what `json.dumps` takes.
-
-        Raises:
-            RecordingError: As for `add_sample`.
-        """
-        text = detail if isinstance(detail, str) else json.dumps(detail, sort_keys=True)
-        event = telemetry_pb2.Event(t_ns=t_ns, cycle=cycle, kind=kind, detail=text)
-        self._add(self._event, t_ns, event.SerializeToString(), 0)
-
-    def add_trajectory(self, t_ns: int, crc: int, rows: bytes) -> None:
-        """Add the reference that a trajectory command started, as an attachment.
-
-        Args:
-            t_ns: Instant of the command on the samples' clock.
-            crc: CRC-32 of `rows`; the command names its reference by it.
-            rows: Doubles in host order, one row a period: q, dq, ddq of all joints.
-
-        Raises:
-            RecordingError: As for `add_sample`.
-        """
-        try:
-            self._writer.add_attachment(t_ns, t_ns, _ROWS_NAME.format(crc), _ROWS_TYPE, rows)
-        except OSError as error:
-            raise self._write_error(error) from error
-
-    def _add(self, channel: int, t_ns: int, payload: bytes, seq: int) -> None:
-        try:
-            self._writer.add_message(channel, t_ns, payload, t_ns, seq & 0xFFFF_FFFF)
-            if t_ns >= self._due_ns:
-                self._due_ns = t_ns + FLUSH_PERIOD_NS
-                self._writer.flush()
-        except OSError as error:
-            raise self._write_error(error) from error
-
-    def _write_error(self, error: OSError) -> RecordingError:
-        return RecordingError(f"cannot write recording {self.path}: {error.strerror}")
-
-    def flush(self) -> None:
-        """Hand everything recorded so far to the kernel: a kill no longer loses it.
-
-        Raises:
-            RecordingError: As for `add_sample`.
-        """
-        try:
-            self._writer.flush()
-        except OSError as error:
-            raise self._write_error(error) from error
-
-    def close(self) -> None:
-        """Write the index and close the file. Idempotent.
-
-        Raises:
-            RecordingError: As for `add_sample`; the file is closed without its index.
-        """
-        if self._is_closed:
-            return
-        self._is_closed = True
-        try:
-            with self._file:
-                self._writer.finish()
-        except OSError as error:
-            raise self._write_error(error) from error
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,14 +46,17 @@ class Recording:
     """A recording read back.
 
     Attributes:
-        path: The file.
+        path: The file; of several parts, the first.
         config: The configuration of the run.
         joints: Of the arm.
         samples: One row per sample; columns are the fields of `hil.v1.Sample`, per-joint ones
             two-dimensional: `samples["q_meas_rad"][:, j]`.
         events: In the order of the file.
         is_truncated: The file ends early (the writer was killed) or is damaged from some point
-            on; what stands before that point is here.
+            on; what stands before that point is here. Of several parts: samples are missing.
+        part: Which part of which run the file is; of several, the first. None if the run has
+            no parts.
+        parts: The files that were read.
     """
 
     path: Path
@@ -230,6 +65,8 @@ class Recording:
     samples: Records
     events: tuple[RecordedEvent, ...]
     is_truncated: bool
+    part: Part | None
+    parts: tuple[Path, ...]
 
     @property
     def has_truth(self) -> bool:
@@ -238,7 +75,7 @@ class Recording:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Read a recording, as much of it as there is.
+        """Read one file, as much of it as there is.
 
         Raises:
             RecordingError: If the file cannot be read, is not MCAP, or is not of this program.
@@ -260,6 +97,37 @@ class Recording:
             samples=_decode_samples(path, layout, payloads),
             events=tuple(events),
             is_truncated=reader.is_truncated,
+            part=reader.part(),
+            parts=(path,),
+        )
+
+    @classmethod
+    def open_run(cls, path: Path) -> Self:
+        """Read a file and the parts of the run that continue it, as one recording.
+
+        A recorder that was killed leaves a part without end, and its successor's part may begin
+        before that end: what stands in both is here once.
+
+        Raises:
+            RecordingError: As for `open`.
+        """
+        files = [cls.open(part) for part in _continued(path)]
+        return files[0] if len(files) == 1 else cls._joined(files)
+
+    @classmethod
+    def _joined(cls, files: Sequence["Recording"]) -> Self:
+        first, last = files[0], files[-1]
+        samples = _without_repeats([file.samples for file in files])
+        gaps = int((np.diff(samples["seq"].astype(np.int64)) != 1).sum())
+        return cls(
+            path=first.path,
+            config=first.config,
+            joints=first.joints,
+            samples=samples,
+            events=tuple(_once(file.events for file in files)),
+            is_truncated=last.is_truncated or gaps > 0,
+            part=first.part,
+            parts=tuple(file.path for file in files),
         )
 
     def frames(self, *, with_marks: bool = False) -> Iterator[LoggedFrame]:
@@ -271,16 +139,16 @@ class Recording:
         Raises:
             RecordingError: If the file is gone, or a bus log in it cannot be read.
         """
-        layout = BusFrameLayout()
-        with _open_mcap(self.path) as file:
-            for topic, payload in _Reader(self.path, file):
-                if topic == "bus":
-                    try:
-                        for frame in layout.decode_log(payload):
-                            if with_marks or frame.direction != MARK:
-                                yield frame
-                    except TelemetryError as error:
-                        raise RecordingError(f"recording {self.path}: {error}") from error
+        seen_ns: int | None = None  # the last instant of the parts before
+        for path in self.parts:
+            last_ns = seen_ns
+            for frame in _frames(path):
+                if seen_ns is not None and frame.t_ns <= seen_ns:
+                    continue
+                last_ns = frame.t_ns
+                if with_marks or frame.direction != MARK:
+                    yield frame
+            seen_ns = last_ns
 
     def trajectories(self) -> dict[int, bytes]:
         """Read the references that were played: CRC-32 -> rows (`RecordingWriter.add_trajectory`).
@@ -288,11 +156,68 @@ class Recording:
         Raises:
             RecordingError: If the file is gone.
         """
-        with _open_mcap(self.path) as file:
-            reader = _Reader(self.path, file)
-            for _ in reader:
-                pass
-            return reader.trajectories
+        found: dict[int, bytes] = {}
+        for path in self.parts:
+            with _open_mcap(path) as file:
+                reader = _Reader(path, file)
+                for _ in reader:
+                    pass
+                found |= reader.trajectories
+        return found
+
+
+def part_of(path: Path) -> Part | None:
+    """Return which part of which run a file is, from its first records; None if it has no parts.
+
+    Raises:
+        RecordingError: If the file cannot be read, is not MCAP, or is not of this program.
+    """
+    with _open_mcap(path) as file:
+        reader = _Reader(path, file)
+        reader.read_metadata()
+    reader.layout()
+    return reader.part()
+
+
+def _continued(path: Path) -> Iterator[Path]:
+    """Return a file and those that continue it, in order."""
+    yield path
+    part = part_of(path)
+    while part is not None:
+        first, part = part.first(path), Part(part.series, part.number + 1)
+        path = part.path(first)
+        if not path.exists() or part_of(path) != part:  # of an earlier run of that name
+            return
+        yield path
+
+
+def _without_repeats(files: Sequence[Records]) -> Records:
+    kept, seen = [], -1
+    for samples in files:
+        new = samples[samples["seq"].astype(np.int64) > seen]
+        if len(new):
+            seen = int(new["seq"][-1])
+            kept.append(new)
+    return np.concatenate(kept) if kept else files[0]
+
+
+def _once(files: Iterable[Sequence[RecordedEvent]]) -> Iterator[RecordedEvent]:
+    before: Sequence[RecordedEvent] = ()
+    for events in files:
+        last_ns = max((event.t_ns for event in before), default=-1)
+        yield from (event for event in events if event.t_ns > last_ns or event not in before)
+        before = events
+
+
+def _frames(path: Path) -> Iterator[LoggedFrame]:
+    layout = BusFrameLayout()
+    with _open_mcap(path) as file:
+        for topic, payload in _Reader(path, file):
+            if topic == "bus":
+                try:
+                    yield from layout.decode_log(payload)
+                except TelemetryError as error:
+                    raise RecordingError(f"recording {path}: {error}") from error
 
 
 def _open_mcap(path: Path) -> BinaryIO:
@@ -327,12 +252,25 @@ class _Reader:
                     yield topics.get(record.channel_id, ""), record.data
                 elif isinstance(record, Channel):
                     topics[record.id] = record.topic
-                elif isinstance(record, Metadata) and record.name == _CONFIG:
+                elif isinstance(record, Metadata) and record.name == CONFIG_NAME:
                     self.metadata = record.metadata
                 elif isinstance(record, Attachment):
                     self.trajectories[crc32(record.data)] = record.data
         except _DAMAGE:
             self.is_truncated = True
+
+    def read_metadata(self) -> None:
+        """Read no further than the metadata of this program."""
+        for _ in self:
+            if self.metadata:
+                return
+
+    def part(self) -> Part | None:
+        """Return which part of a run this is, known once the metadata has passed."""
+        try:
+            return Part(self.metadata["series"], int(self.metadata["part"]))
+        except (KeyError, ValueError):
+            return None
 
     def layout(self) -> SampleLayout:
         """Return the samples' layout, known once the metadata has passed."""
@@ -343,7 +281,8 @@ class _Reader:
             return SampleLayout(joints, json.loads(self.metadata["with_truth"]) is True)
         except (KeyError, ValueError) as error:
             raise RecordingError(
-                f"{self.path} is MCAP but not a recording of this program (no {_CONFIG} metadata)"
+                f"{self.path} is MCAP but not a recording of this program"
+                f" (no {CONFIG_NAME} metadata)"
             ) from error
 
 

@@ -173,6 +173,10 @@ class RingReader:
                 self.lost += 1
         return objects
 
+    def skip(self) -> None:
+        """Pass over everything written so far; it does not count as lost."""
+        self.place = self._ring.head
+
     def commit(self) -> None:
         """Note that everything read so far is dealt with."""
         self._cursor[0] = self.place
@@ -187,6 +191,7 @@ class SharedMemory:
         frames: Ring of serialised `BusLog`, one or more a cycle, written by the loop.
         events: Ring of JSON events, written by the loop.
         commands: Ring of JSON commands, written by the gateway.
+        notes: Ring of JSON events about the recording, written by the recorder.
         layout: Layout of a sample.
         frame_layout: Layout of a bus frame.
     """
@@ -204,8 +209,10 @@ class SharedMemory:
         self.frames = self._ring("frames")
         self.events = self._ring("events")
         self.commands = self._ring("commands")
+        self.notes = self._ring("notes")
         self._status = self._ring("status")
         self._estop = self._view("estop").cast("Q")
+        self._part = self._view("recorder.part").cast("Q")
         self._beats = {who: self._view(f"{who}.beat").cast("Q") for who in _CHILDREN}
 
     @classmethod
@@ -263,6 +270,15 @@ class SharedMemory:
         """Number of emergency stops asked for so far."""
         return self._estop[0]
 
+    @property
+    def recording_part(self) -> int:
+        """Number of the recording's part that was begun last, 0 before the first."""
+        return self._part[0]
+
+    @recording_part.setter
+    def recording_part(self, number: int) -> None:
+        self._part[0] = number
+
     def post_status(self, status: Mapping[str, Any]) -> None:
         """Publish the loop's status; the last one counts."""
         self._status.append(json.dumps(status).encode())
@@ -296,11 +312,12 @@ def _plan(
         "frames": (frame_size * FRAMES_AT_ONCE, cycles),
         "events": (_EVENT_BYTES, 512),
         "commands": (_EVENT_BYTES, 64),
+        "notes": (_EVENT_BYTES, 64),
         "status": (_STATUS_BYTES, 4),
     }
     words = ["estop", "loop.commands", *(f"{who}.beat" for who in _CHILDREN)]
     words += [f"{who}.{part}" for who in ("gateway", "recorder") for part in ("samples", "events")]
-    words += ["recorder.frames"]
+    words += ["recorder.frames", "recorder.part", "gateway.notes"]
     plan: dict[str, tuple[int, ...]] = {}
     at = _CONFIG_SIZE
     for word in words:

@@ -35,6 +35,7 @@ class Streams:
         self._session = session
         self._samples = shared.reader("samples", "gateway")
         self._events = shared.reader("events", "gateway")
+        self._notes = shared.reader("notes", "gateway")
         window = round(WINDOW_S / shared.config.loop.period_s)
         self._late_ns: deque[int] = deque(maxlen=window)
         self._busy_ns: deque[int] = deque(maxlen=window)
@@ -66,12 +67,14 @@ class Streams:
         """Publish what is new. Blocks while a subscriber does not keep up, for some seconds."""
         self._samples.commit()  # what was put a turn ago has left this process
         self._events.commit()
+        self._notes.commit()
         if self._is_holding and self._is_worth_holding():
             return
         self._is_holding = False
         self._publish_samples()
-        for record in self._events.read(EVENTS_AT_ONCE):
-            self._event.put(record)
+        for events in (self._events, self._notes):
+            for record in events.read(EVENTS_AT_ONCE):
+                self._event.put(record)
 
     def run(self, is_ended: list[int]) -> None:
         """Take a turn every 10 ms until `is_ended` is not empty, and one more then."""

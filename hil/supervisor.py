@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
+from uuid import uuid4
 
 from hil.config import Config
 from hil.errors import HilError
@@ -86,7 +87,7 @@ class Supervisor:
         self._shared = SharedMemory.create(config)
         self._config = config
         self._recording = recording
-        self._recordings = 0
+        self._series = uuid4().hex
         self._children: dict[str, _Child] = {}
         self._is_ended = False
 
@@ -124,19 +125,14 @@ class Supervisor:
         command = [sys.executable, "-m", "hil.process", name]
         command += [str(self._shared.fd), str(os.getpid())]
         if name == "recorder":
-            command.append(str(self._next_recording()))
+            command += [str(self._recording), self._series]
+        held = {signal.SIGTERM} if name == "recorder" else set()  # what the rings hold is written
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, held)  # even by one that just starts
         process = subprocess.Popen(  # noqa: S603 - our own module and arguments
             command, pass_fds=[self._shared.fd], start_new_session=True
         )
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         self._children[name] = _Child(process, monotonic(), failures)
-
-    def _next_recording(self) -> Path:
-        """A restarted recorder goes on in a file of its own: the first stays as it is."""
-        assert self._recording is not None  # noqa: S101 - there is a recorder
-        self._recordings += 1
-        if self._recordings == 1:
-            return self._recording
-        return self._recording.with_stem(f"{self._recording.stem}-{self._recordings}")
 
     def _await_start(self) -> int | None:
         """Wait until all children show themselves.
@@ -213,7 +209,7 @@ class Supervisor:
         """Ask the loop for an orderly end and wait for it."""
         loop = self._children["loop"].process
         loop.terminate()
-        allowed_s = self._config.controller.limits.stop_timeout_s + STOP_MARGIN_S
+        allowed_s = self._config.controller.stop_time_s + STOP_MARGIN_S
         try:
             status = loop.wait(allowed_s)
         except subprocess.TimeoutExpired:
@@ -226,11 +222,13 @@ class Supervisor:
         for name in ("loop", "gateway", "recorder"):
             if name not in self._children:
                 continue
+            if name == "recorder" and (self._children[name].status or 0) < 0:
+                self._spawn(name)  # killed just before: the rings hold what it has not written
             process = self._children[name].process
             if process.poll() is None:
                 process.terminate()
             try:
-                process.wait(STOP_MARGIN_S)
+                process.wait(STOP_MARGIN_S if name != "recorder" else START_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

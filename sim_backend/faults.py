@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from random import Random
 
 from drivers.fault_frame import FaultKind, FaultOrder, FaultTarget
-from drivers.frame import SFF_MASK, is_fd, pack_fd_frame, pack_frame, unpack_frame
+from drivers.frame import SFF_MASK, is_fd, pack_fd_frame, pack_frame, unpack_frame, unpack_header
 from sim_backend.node import AmplifierNode, Transmit
 from sim_backend.servo import Servo
 from sim_backend.settings import FaultSettings
@@ -102,10 +102,16 @@ class Line:
         if self._kind is FaultKind.SLOW:
             self._room = 0 if queue else 1
             if queue:
-                self._let_go(*queue.popleft()[1:])
+                self._let_go(*self._take_strongest()[1:])
         elif self._kind in (FaultKind.DELAYED, FaultKind.WRONG):
             while queue and queue[0][0] < before:
                 self._let_go(*queue.popleft()[1:])
+
+    def _take_strongest(self) -> tuple[int, int, bytes]:
+        """Take the frame that wins arbitration: of the lowest identifier, the oldest."""
+        first = min(self._queue, key=lambda entry: unpack_header(entry[2])[0])
+        self._queue.remove(first)
+        return first
 
     def _any_frame(self, frame: bytes) -> bytes:
         can_id, data = unpack_frame(frame)

@@ -13,6 +13,8 @@ from drivers.frame import pack_frame, unpack_frame
 
 HIL_PRODUCT_CODE = 0x48494C31
 """1018:02 of the emulated drive; only there has 2F00 the meaning `time base`."""
+PLAUSIBLE_TURN = 0.125
+"""No joint turns so far between two readings; after one that says so, turns are counted anew."""
 RESET_CYCLES = 10
 """Cycles for which the fault-reset edge is held."""
 HEARTBEATS_BEFORE_BOOT_UP = 8
@@ -51,6 +53,8 @@ class Cia402Axis(Axis):
         self._range_counts = 0
         self._position: int | None = None
         self._counts = 0
+        self._plausible_step = round(PLAUSIBLE_TURN * settings.counts_per_turn)
+        self._is_count_doubtful = False
         self._statusword = -1
         self._controlword = codec.CONTROL_DISABLE_VOLTAGE
         self._wants_power = False
@@ -223,6 +227,12 @@ class Cia402Axis(Axis):
         self.status = AxisStatus.DISABLED
         self._statusword = -1  # look at the next one afresh
 
+    def recount(self) -> None:
+        """See `Axis.recount`."""
+        if self._is_count_doubtful:
+            self._is_count_doubtful = False
+            self._position = None
+
     def end_cycle(self) -> None:
         """Count the silence since the last heartbeat."""
         self._heartbeat_age += 1
@@ -259,8 +269,10 @@ class Cia402Axis(Axis):
             self._counts -= excess * self._settings.counts_per_turn * self._settings.direction
         else:
             half = self._range_counts // 2
-            step = position - self._position
-            self._counts += (step + half) % self._range_counts - half
+            step = (position - self._position + half) % self._range_counts - half
+            self._counts += step
+            if not -self._plausible_step <= step <= self._plausible_step:
+                self._is_count_doubtful = True
         self._position = position
         self.q_rad = self._counts * self._rad_per_count + self._settings.offset_rad
 

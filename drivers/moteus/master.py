@@ -80,8 +80,8 @@ class MoteusAxis(Axis):
             + codec.pack_head(READ, Register.SERIAL_NUMBER_1, Resolution.INT32, 3),
         )
         model = int(identity.get(Register.MODEL_NUMBER, -1))
-        self._is_emulated = model == HIL_MODEL_NUMBER
-        is_lockstep = self._is_emulated and identity.get(Register.SERIAL_NUMBER_2) == 1
+        is_emulated = model == HIL_MODEL_NUMBER
+        is_lockstep = is_emulated and identity.get(Register.SERIAL_NUMBER_2) == 1
         self._check_watchdog(port)
         console = Console(port, (self._request_id, self._reply_id), self.label, s.reply_timeout_s)
         console.start()
@@ -91,7 +91,7 @@ class MoteusAxis(Axis):
         version = int(identity.get(Register.FIRMWARE_VERSION, 0))
         name = f"moteus model {model & 0xFFFFFFFF:X} firmware {version & 0xFFFFFFFF:06X}"
         torque_Nm = math.ldexp(1.0, math.frexp(s.torque_max_Nm)[1] - 24)  # float32
-        return AxisInfo(name, torque_Nm, angle_rad, is_lockstep, self._is_emulated)
+        return AxisInfo(name, torque_Nm, angle_rad, is_lockstep, is_emulated)
 
     def start(self, port: Port) -> None:
         """Nothing to do: the controller is ready for commands."""

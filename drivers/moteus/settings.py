@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from drivers.moteus.codec import STATE_LENGTH, STOP, TORQUE_LENGTH
+from drivers.moteus.codec import STATE_LENGTH, STOP, TORQUE_LENGTH, reply_id
 from drivers.settings import ACYCLIC, AxisSettings, CycleFrame
 
 _STANDARD_NODES = 7  # replies of node ids above need 29 bits: the node id stands in bits 8 to 14
@@ -46,6 +46,21 @@ class MoteusSettings(AxisSettings):
     def node(self) -> int:
         """The controller's id."""
         return self.node_id
+
+    def identifiers(self) -> dict[int, str]:
+        """Of 11 bits: what the controller obeys, of whatever length of identifier, and its reply.
+
+        It takes classic frames too: an RPDO or SDO request to the CANopen node of its number would
+        be read as a command. A prefix keeps all of its frames to 29 bits.
+        """
+        if self.can_prefix:
+            return {}
+        heard = {
+            source << 8 | self.node_id: f"a command to moteus id {self.node_id}"
+            for source in range(_STANDARD_NODES + 1)
+        }
+        reply = reply_id(self.node_id, self.source_id)
+        return heard | ({reply: "reply"} if self.node_id <= _STANDARD_NODES else {})
 
     def cycle_frames(self, period_s: float) -> tuple[CycleFrame, ...]:
         """A torque command and its reply; now and then a stop, and its reply."""

@@ -8,7 +8,7 @@ from drivers.errors import AmplifierError
 from drivers.frame import pack_frame, unpack_frame
 from drivers.odrive import codec
 from drivers.odrive.codec import AxisError, AxisState, Command, Heartbeat
-from drivers.odrive.endpoints import INJECT_FAULT_ID, LAYOUT, Endpoint, EndpointTable
+from drivers.odrive.endpoints import EMULATED_SERIAL, INJECT_FAULT_ID, LAYOUT, Endpoint, EndpointTable
 from drivers.odrive.service import OdriveService, choose_table, refuse_unless_idle, shown
 from drivers.odrive.settings import OdriveSettings
 
@@ -94,7 +94,8 @@ class OdriveAxis(Axis):
         board, firmware = shown(version.hardware), shown(version.firmware)
         name = f"ODrive {board}, firmware {firmware}, serial {serial:012X}"
         torque_step_Nm = codec.f32_spacing(self._torque_max_motor_Nm) * s.gear_ratio
-        return AxisInfo(name, torque_step_Nm, resolution_rad, is_lockstep)
+        is_emulated = serial & 0xFF_FFFF == EMULATED_SERIAL
+        return AxisInfo(name, torque_step_Nm, resolution_rad, is_lockstep, is_emulated)
 
     def _set_up(self, service: OdriveService) -> None:
         values = self._values()
@@ -215,8 +216,11 @@ class OdriveAxis(Axis):
 
     def disable(self) -> None:
         """Ask for torque off with the next command frame: 0x07 = 1."""
+        is_clearing = self._clear in self._queue
         self._drop_power()
         self._queue.append(self._idle)
+        if is_clearing:  # a reset is disabled right after it was asked for
+            self._queue.append(self._clear)
         if self.status is AxisStatus.ENABLED:
             self.status = AxisStatus.DISABLED
 

@@ -37,10 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     bounds.add_argument("--min", nargs="+", type=float, required=True, metavar="KD")
     bounds.add_argument("--max", nargs="+", type=float, required=True, metavar="KD")
     add_connection(bounds)
-    fault = commands.add_parser("fault", help="inject a fault into an emulated amplifier")
+    fault = commands.add_parser("fault", help="ask the emulator for a fault, or to end it")
     fault.add_argument("--target", default="amplifier")
     fault.add_argument("--kind", default="off")
     fault.add_argument("--joint", type=int)
+    fault.add_argument("--duration", type=float, metavar="S", help="default: until `--kind ok`")
     add_connection(fault)
 
 
@@ -69,6 +70,7 @@ def request(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
                 "target": options.target,
                 "kind": options.kind,
                 "joint": options.joint,
+                "duration_s": options.duration,
             }
         case plain:
             return plain, {}

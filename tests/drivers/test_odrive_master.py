@@ -579,6 +579,15 @@ def test_reset__old_error_still_in_a_heartbeat__forgiven():
     assert axis.status is AxisStatus.FAULT
 
 
+def test_reset__disabled_before_it_was_sent__still_sent():
+    axis = lone_axis()
+    tell(axis, heartbeat(errors=AxisError.DRV_FAULT))
+    axis.reset_fault()
+    axis.disable()
+    sent = [unpack_frame(axis.command(1.0))[0] for _ in range(3)]
+    assert sent == [0x027, 0x038, 0x02E]
+
+
 @pytest.mark.parametrize("command", [Command.HEARTBEAT, Command.ERROR, Command.TX_SDO,
                                      Command.TORQUES, Command.ENCODER])  # fmt: skip
 @pytest.mark.parametrize("length", range(9))
