@@ -14,6 +14,7 @@ from drivers.frame import (
     unpack_frame,
     unpack_header,
 )
+from drivers.probe import Probe
 
 SYNC_ID = 0x080
 HEARTBEAT_ID = 0x700
@@ -26,6 +27,9 @@ OVERDUE_FRAMES = 100
 FLOOD_FRAMES = 4096
 """So many leftovers at the start of a cycle are more than a second's stall leaves behind: the bus
 is flooded, and what is still queued is too old to be used."""
+
+PROBE_LOCKSTEP_NS = 50_000_000
+"""Emulated time waits, so that a probe in lockstep need not last longer than answers travel."""
 
 FrameLog = Callable[[int, bytes], None]
 """Called with (RECEIVED or SENT, record) for every frame, in the order seen, and with MARK."""
@@ -40,14 +44,10 @@ class ArmBus:
     Attributes:
         axes: Shoulder first.
         stats: The bus's own counters.
-        late_frames: Feedback that arrived after its cycle had ended; discarded.
+        late_frames: Feedback that arrived after its cycle had ended; discarded. Whether it did is
+            found out by a probe (`drivers.probe`) if it came a whole period late.
         unknown_frames: Frames that belong to no axis of this arm.
         error_frames: Error reports of the CAN controller.
-
-    An answer that comes a whole period late looks like one in time. After a gap, therefore, one
-    cycle goes by without a request (a probe): whoever answers in it answers an older one. Until a
-    probe passes in silence, the answers of the amplifiers that are asked count as missing, and as
-    `late_frames`.
     """
 
     def __init__(
@@ -63,11 +63,8 @@ class ArmBus:
         self._log: FrameLog | None = None
         self._is_flooded = False
         self._is_emulated = False
-        self._has_gap = False
-        self._is_probing = False
-        self._is_suspect = False
-        self._tick = pack_frame(LOCKSTEP_ID)
-        self._asked = [a for a in axes if a.uses_sync or type(a).request is not Axis.request]
+        self._is_lockstep = False
+        self._probe = Probe()
         self._handlers: dict[int, FrameHandler] = {}
         self._shared_ids: frozenset[int] = frozenset()
         self._sync = pack_frame(SYNC_ID) if any(a.uses_sync for a in axes) else None
@@ -102,6 +99,8 @@ class ArmBus:
         if len({info.is_lockstep for info in infos}) > 1:
             raise AmplifierError("some axes run in lockstep and some by the clock; choose one")
         self._is_emulated = all(info.is_emulated for info in infos)
+        self._is_lockstep = infos[0].is_lockstep
+        self._probe.watch(self.axes)
         if self._sync is None and infos[0].is_lockstep:
             self._sync = pack_frame(LOCKSTEP_ID)
         for axis in self.axes:
@@ -128,7 +127,7 @@ class ArmBus:
     def request_feedback(self) -> None:
         """Begin a cycle: discard what came too late for the last one, then ask, SYNC last."""
         self._drain()
-        if self._is_probing:
+        if self._probe.is_due:
             self._begin_probe()
             return
         for axis in self._requesting:
@@ -157,8 +156,22 @@ class ArmBus:
                 missing += 1
         if self._is_flooded:
             return False
-        if self._is_probing:
-            return self._probe(deadline_ns)
+        probe = self._probe
+        if not probe.is_at_ease:
+            if probe.is_due:
+                return self._listen(deadline_ns)
+            probe.note_ages()
+        if self._receive(missing, deadline_ns):
+            probe.note_gap()
+            return False
+        if probe.is_at_ease:
+            return True
+        late = probe.believe()
+        self.late_frames += late
+        return not late
+
+    def _receive(self, missing: int, deadline_ns: int) -> int:
+        """Receive until nobody is missing, or until the deadline; return who still is."""
         overdue = 0
         recv, handlers, log = self._bus.recv, self._handlers, self._log
         while missing:
@@ -178,47 +191,23 @@ class ArmBus:
                 self._count_foreign(frame)
             elif handler(frame):
                 missing -= 1
-        if missing:
-            self._has_gap = True
-            return False
-        return not (self._has_gap or self._is_suspect) or self._judge_answers()
-
-    # --- answers that come too late -----------------------------------------------------------
-
-    def _judge_answers(self) -> bool:
-        """All have answered, after a gap: have it proved; the first time they are believed."""
-        self._is_probing = bool(self._asked)
-        self._has_gap = False
-        if self._is_suspect:
-            self._disbelieve()
-        return not self._is_suspect
-
-    def _disbelieve(self) -> None:
-        for axis, age in zip(self._asked, self._ages, strict=True):
-            axis.age_cycles = age + 1
-            self.late_frames += 1
-        self._ages = [axis.age_cycles for axis in self._asked]
+        return missing
 
     def _begin_probe(self) -> None:
         """Begin a cycle without asking; emulated time goes on all the same."""
         if self._is_lockstep:
-            self._send(self._tick)
+            self._send(pack_frame(LOCKSTEP_ID))
         if self._log is not None:
             self._log(MARK, NO_FRAME)
 
-    def _probe(self, deadline_ns: int) -> bool:
-        """Listen until the deadline: an answer now was asked for a period ago, or earlier."""
-        self._is_probing = False
-        asked = self._asked
-        ages = [axis.age_cycles for axis in asked]
-        self._receive_until(deadline_ns)
-        late = [axis for axis, age in zip(asked, ages, strict=True) if axis.age_cycles < age]
-        self._is_suspect = bool(late)
-        self.late_frames += len(late)
-        for axis, age in zip(asked, ages, strict=True):
-            axis.age_cycles = age
-        self._ages = ages
-        return not asked
+    def _listen(self, deadline_ns: int) -> bool:
+        """Take what comes in a probe; fresh is only what axes send that nobody asks."""
+        if self._is_lockstep:
+            deadline_ns = min(deadline_ns, self._now_ns() + PROBE_LOCKSTEP_NS)
+        self._probe.note_ages()
+        self._receive(len(self.axes) + 1, deadline_ns)
+        self.late_frames += self._probe.judge()
+        return self.age_cycles == 0
 
     def send_torques(self, tau_Nm: Sequence[float]) -> None:
         """End a cycle: send every axis its command, and the heartbeat when it is due.

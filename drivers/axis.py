@@ -103,6 +103,11 @@ class Axis(ABC):
         """Identifiers on which other axes may be answered too: its handler knows its own frames."""
         return frozenset()
 
+    @property
+    def is_asked(self) -> bool:
+        """Feedback is the answer to SYNC or to `request`; no family that is asked sends unasked."""
+        return self.uses_sync or type(self).request is not Axis.request
+
     def request(self) -> bytes | None:
         """Return the frame that asks for feedback at the start of a cycle, None if none is needed.
 

@@ -14,10 +14,28 @@ from can.io.generic import MessageReader, MessageWriter
 from drivers.buses.python_can import from_message, to_message
 from drivers.errors import DriverError
 
+_BLF_OBJECT = struct.Struct("<4sHHI")
+"""Head of an object in a BLF container: `LOBJ`, size of the head, its version, size of all."""
+_BLF_PADDING_MAX = 8
+
+
+class _BlfReader(can.BLFReader):
+    """python-can's reader, without standing still at a damaged object that says it has no size."""
+
+    def _parse_data(self, data: bytes) -> Iterator[can.Message]:
+        place = data.find(b"LOBJ")
+        while 0 <= place <= len(data) - _BLF_OBJECT.size:
+            size = _BLF_OBJECT.unpack_from(data, place)[3]
+            if size < _BLF_OBJECT.size:
+                raise ValueError(f"an object of {size} bytes")
+            place = data.find(b"LOBJ", place + size, place + size + _BLF_PADDING_MAX)
+        return super()._parse_data(data)
+
+
 _READERS: dict[str, tuple[str, Callable[..., MessageReader]]] = {  # suffix -> file mode, reader
     ".log": ("r", can.CanutilsLogReader),
     ".asc": ("r", can.ASCReader),
-    ".blf": ("rb", can.BLFReader),
+    ".blf": ("rb", _BlfReader),
 }
 SUFFIXES = tuple(_READERS)
 _BROKEN = (

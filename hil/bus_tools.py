@@ -12,6 +12,8 @@ from hil.errors import HilError
 
 POLL_S = 0.05
 """Longest time between two looks at whether to end."""
+LEFT_OVER_FRAMES = 10_000
+"""Frames that wait to be read at the end and are taken along, at most."""
 QUEUE_TIMEOUT_S = 1.0
 """A bus that takes no frame for this long is not working."""
 
@@ -35,6 +37,8 @@ def is_virtual(address: str) -> bool:
 def frames_of(bus: Bus, is_ended: Callable[[], bool]) -> Iterator[tuple[float, bytes] | None]:
     """Yield (seconds since the epoch, frame) as frames arrive, and None while nothing does.
 
+    At the end come the frames that have arrived by then.
+
     Args:
         bus: An open bus.
         is_ended: Asked between frames, at least every 50 ms.
@@ -45,6 +49,11 @@ def frames_of(bus: Bus, is_ended: Callable[[], bool]) -> Iterator[tuple[float, b
     while not is_ended():
         frame = bus.recv(POLL_S)
         yield None if frame is None else (time(), frame)
+    for _ in range(LEFT_OVER_FRAMES):
+        frame = bus.recv(0.0)
+        if frame is None:
+            return
+        yield time(), frame
 
 
 @dataclass(slots=True)

@@ -28,6 +28,8 @@ LEVELS = (0.25, 0.5, 1.0)
 OVER_LIMIT = 10.0
 RESOLUTION_STEPS = 3
 """Reported torque may always be off by so many of its own steps."""
+TORQUE_STEPS = 20
+"""Least number of the drive's torque steps that the torque of the run has to be."""
 NOISE_SHARE = 0.1
 """Torque that counts as none, as a share of `Limits.torque_Nm`."""
 DECAY_CYCLES = 3
@@ -149,6 +151,12 @@ def start_up(bench: Bench) -> str:
     info = bench.info
     if info is None:
         raise StepError(bench.start_error)
+    least_Nm = TORQUE_STEPS * info.torque_resolution_Nm
+    if bench.limits.torque_Nm < least_Nm:
+        raise StepError(
+            f"{bench.limits.torque_Nm:g} Nm is too little to judge torque in steps of "
+            f"{info.torque_resolution_Nm:.3g} Nm; use --torque {least_Nm:.3g} or more"
+        )
     mode = "lockstep" if info.is_lockstep else "by its own clock"
     return (
         f"{info.name}, {mode}; torque in steps of {_thousandths(info.torque_resolution_Nm)} mNm, "

@@ -259,9 +259,7 @@ class Control:
         if speed_rad_s <= self._stop_speed_rad_s:
             return False
         told = "the damped stop makes the arm faster; check the sign of the torque"
-        self._trip(
-            FaultCode.VELOCITY, value=speed_rad_s, limit=self._stop_speed_rad_s, detail=told
-        )
+        self._trip(FaultCode.VELOCITY, value=speed_rad_s, limit=self._stop_speed_rad_s, detail=told)
         return True
 
     def _bridge_gap(self) -> list[float]:
@@ -277,7 +275,8 @@ class Control:
             ]
             return self._limiter.step(damped, self._period_s)
         silent = next(axis for axis in self._bus.axes if axis.age_cycles)
-        self._trip(FaultCode.FEEDBACK_LOST, detail=f"{silent.label}: silent for {self._age} cycles")
+        why = silent.note or f"{silent.label}: silent"
+        self._trip(FaultCode.FEEDBACK_LOST, detail=f"{why} for {self._age} cycles")
         return self._rest()
 
     # --- power and faults -------------------------------------------------------------------

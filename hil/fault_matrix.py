@@ -7,7 +7,7 @@ again. What the arm did is taken from the plant itself, not from what the contro
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Final
+from typing import Final, Literal
 
 from controller.faults import FaultCode
 from controller.machine import State
@@ -15,6 +15,7 @@ from controller.reference import MotionLimits, MotionState
 from drivers.fault_frame import FaultKind, FaultTarget
 from drivers.registry import SETTINGS
 from hil.config import Config, load_config
+from hil.control import AT_REST_RAD_S
 from hil.messages import SinusoidRequest
 from hil.planner import plan
 from hil.simulation import Simulation
@@ -28,8 +29,60 @@ SWING_S: Final = 0.6
 """Into the swing when the fault comes: near the largest speed."""
 FAULT_S: Final = 0.6
 ENABLE_CYCLES: Final = 1500
-SETTLE_CYCLES: Final = 500
+SETTLE_CYCLES: Final = 100
+SETTLE_MOST_CYCLES: Final = 6000
+RECOVERY_CYCLES: Final = 100
 REST_Nm: Final = 1e-9
+STOP_RAD: Final = 3.0
+"""Mechanical stops of the arm, beyond its hard limits: a joint cannot turn on and on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """What a fault may lead to.
+
+    Attributes:
+        reaction_cycles: Latest trip, None if the motion may go on.
+        off_cycles: From the trip until no motor makes torque, at most.
+        travel_rad: Way after the trip, while the fault lasts, at most.
+    """
+
+    reaction_cycles: int | None
+    off_cycles: int
+    travel_rad: float
+
+
+SEEN: Final = Bound(20, 20, 0.4)
+"""Told by the first wrong value, or reported by the amplifier (ODrive: with its heartbeat)."""
+GAP: Final = Bound(35, 60, 0.5)
+"""Feedback is missing or late: n_hold + n_damp cycles; the amplifiers' watchdogs may act first."""
+TOLERATED: Final = Bound(None, 0, 0.0)
+_BOUNDS: Final = {
+    ("encoder", "stuck"): Bound(560, 90, 0.8),
+    ("encoder", "slow"): TOLERATED,
+    ("encoder", "delayed"): TOLERATED,
+    ("amplifier", "stuck"): GAP,
+    ("amplifier", "garbage"): GAP,
+    ("amplifier", "wrong"): Bound(220, 150, 4.0),
+    ("amplifier", "slow"): TOLERATED,
+    ("amplifier", "delayed"): GAP,
+    ("amplifier", "intermittent"): TOLERATED,
+    ("bus", "off"): GAP,
+    ("bus", "stuck"): GAP,
+    ("bus", "garbage"): Bound(35, 120, 1.0),
+    ("bus", "wrong"): TOLERATED,
+    ("bus", "slow"): GAP,
+    ("bus", "delayed"): GAP,
+    ("bus", "intermittent"): TOLERATED,
+    ("host", "off"): GAP,
+    ("host", "stuck"): GAP,
+    ("host", "garbage"): Bound(35, 120, 1.0),
+    ("host", "wrong"): TOLERATED,
+    ("host", "slow"): GAP,
+    ("host", "delayed"): GAP,
+    ("host", "intermittent"): TOLERATED,
+}
+"""(target, kind) -> bound of every family; what is not here is `SEEN`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +108,9 @@ class Outcome:
         speed_rad_s: Largest true speed of any joint after the fault came.
         end_state: While the fault still acted.
         fault: Latched by then.
-        recovered: The arm was READY again after the end of the fault, reset and enable.
+        recovery: After the end of the fault and at rest, reset and enable lead to READY (`yes`), or
+            the arm has come to rest beyond its hard limit and is refused until it is moved
+            (`by hand`), or neither (`no`).
         offset_rad: How far the measured pose was then from the true one, at most.
     """
 
@@ -68,7 +123,7 @@ class Outcome:
     speed_rad_s: float
     end_state: State
     fault: FaultCode
-    recovered: bool
+    recovery: Literal["yes", "by hand", "no"]
     offset_rad: float
 
 
@@ -83,8 +138,15 @@ def cells(families: Sequence[str] = FAMILIES) -> Iterator[Cell]:
 @cache
 def matrix_config(family: str) -> Config:
     """Return the configuration of a family's runs: the default arm, nothing else set."""
-    axes = {str(joint): {"family": family} for joint in (1, 2)}
-    return load_config(None, {"axes": axes})
+    joints = ("1", "2")
+    stops = {"q_min_rad": -STOP_RAD, "q_max_rad": STOP_RAD}
+    return load_config(
+        None,
+        {
+            "axes": {joint: {"family": family} for joint in joints},
+            "plant": {"links": dict.fromkeys(joints, stops)},
+        },
+    )
 
 
 class Run:
@@ -134,7 +196,7 @@ class Run:
             self._watch(cycle)
 
     def _watch(self, cycle: int) -> None:
-        control, plant = self.simulation.control, self.simulation._plant
+        control, plant = self.simulation.control, self.simulation.plant
         torque_Nm = max(abs(tau) for tau in plant.tau_applied_Nm)
         q_rad = plant.q_true_rad
         self._speed_rad_s = max(self._speed_rad_s, *(abs(dq) for dq in plant.dq_true_rad_s))
@@ -150,20 +212,30 @@ class Run:
         else:
             self._after_trip_rad = max(self._after_trip_rad, _distance(q_rad, self._pose_rad))
 
-    def recover(self) -> tuple[bool, float]:
-        """End the fault, reset and enable; return whether that worked, and the pose's error."""
+    def recover(self) -> tuple[Literal["yes", "by hand", "no"], float]:
+        """Wait for rest, reset and enable; return whether that worked, and the pose's error."""
         simulation = self.simulation
-        simulation.run(SETTLE_CYCLES)
         machine = simulation.control.machine
+        simulation.run(SETTLE_CYCLES)
+        for _ in range(SETTLE_MOST_CYCLES // SETTLE_CYCLES):
+            if machine.state is State.ACTIVE or max(map(abs, self._rates())) < AT_REST_RAD_S:
+                break
+            simulation.run(SETTLE_CYCLES)
         if machine.state in (State.FAULT, State.ESTOP):
             simulation.execute("reset")
-            simulation.run(20)
+            simulation.run(RECOVERY_CYCLES // 2)
         if machine.state is State.IDLE:
             simulation.execute("enable")
-        simulation.run(100)
+        simulation.run(RECOVERY_CYCLES)
         # The sample at hand was latched when the truth was.
-        offset_rad = _distance(simulation.control.q_rad, simulation._plant.q_true_rad)
-        return machine.state in (State.READY, State.ACTIVE), offset_rad
+        offset_rad = _distance(simulation.control.q_rad, simulation.plant.q_true_rad)
+        if machine.state in (State.READY, State.ACTIVE):
+            return "yes", offset_rad
+        is_out = machine.fault is FaultCode.POSITION_HARD
+        return "by hand" if is_out else "no", offset_rad
+
+    def _rates(self) -> Sequence[float]:
+        return self.simulation.plant.dq_true_rad_s
 
     def outcome(self, cell: Cell) -> Outcome:
         """Run the cell from beginning to end."""
@@ -171,7 +243,7 @@ class Run:
         self.disturb(cell.target, cell.kind)
         machine = self.simulation.control.machine
         state, fault = machine.state, machine.fault
-        recovered, offset_rad = self.recover()
+        recovery, offset_rad = self.recover()
         has_tripped = self._tripped_at is not None
         return Outcome(
             cell,
@@ -183,9 +255,38 @@ class Run:
             self._speed_rad_s,
             state,
             fault,
-            recovered,
+            recovery,
             offset_rad,
         )
+
+
+def bound_of(cell: Cell) -> Bound:
+    """Return the bound that a cell must keep."""
+    return _BOUNDS.get((cell.target, cell.kind), SEEN)
+
+
+def broken_bounds(outcome: Outcome, tau_max_Nm: float) -> list[str]:
+    """Say what an outcome breaks, one line each; empty if it keeps all bounds."""
+    bound = bound_of(outcome.cell)
+    broken = []
+    if outcome.tau_max_Nm > tau_max_Nm * 1.001:
+        broken.append(f"torque {outcome.tau_max_Nm:.2f} Nm above {tau_max_Nm:g} Nm")
+    if outcome.recovery == "no":
+        broken.append("the arm does not come back after the fault")
+    if outcome.offset_rad > 0.02:
+        broken.append(f"the pose is {outcome.offset_rad:.3f} rad wrong after the fault")
+    if outcome.reaction_cycles is None:
+        if bound.reaction_cycles is not None:
+            broken.append(f"no reaction within {bound.reaction_cycles} cycles")
+        return broken
+    if bound.reaction_cycles is not None and outcome.reaction_cycles > bound.reaction_cycles:
+        broken.append(f"reaction after {outcome.reaction_cycles} > {bound.reaction_cycles} cycles")
+    off = (outcome.off_cycles or 0) - outcome.reaction_cycles
+    if off > bound.off_cycles:
+        broken.append(f"torque off {off} > {bound.off_cycles} cycles after the trip")
+    if (outcome.after_trip_rad or 0.0) > bound.travel_rad:
+        broken.append(f"{outcome.after_trip_rad:.2f} > {bound.travel_rad:g} rad after the trip")
+    return broken
 
 
 def run_cell(cell: Cell) -> Outcome:

@@ -9,13 +9,14 @@ on.
 import json
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from time import sleep
 from typing import Any
 from zlib import crc32
 
+from hil.black_box import BlackBox
 from hil.errors import HilError
 from hil.process import outlast_loop
 from hil.realtime import die_with_parent, now_ns
@@ -26,7 +27,7 @@ from hil.shared import SharedMemory
 DRAIN_EVERY_S = 0.05
 """Half of what a kill of all processes may cost."""
 AT_ONCE = 4000
-_CLEAN_UP_EVERY_NS = 1_000_000_000
+CLEAN_UP_EVERY_NS = 1_000_000_000
 
 
 class Recorder:
@@ -36,6 +37,9 @@ class Recorder:
         shared: The daemon's shared memory.
         first: File of the run's first part; one that exists is replaced.
         series: Name of the run in its parts, see `hil.recording_writer.Part`.
+
+    Attributes:
+        clean_up_every_ns: How often the disk budget is looked after.
 
     Raises:
         RecordingError: If the file cannot be created.
@@ -51,8 +55,10 @@ class Recorder:
         self._frames = shared.reader("frames", "recorder")
         self._events = shared.reader("events", "recorder")
         self._writer: RecordingWriter | None = None
+        self._black_box = BlackBox(shared, first)
         self._cycle = 0
         self._began_ns = 0
+        self.clean_up_every_ns = CLEAN_UP_EVERY_NS
         self._clean_up_ns = 0
         lack = self._retention.lack_of_space()
         if lack:
@@ -134,7 +140,7 @@ class Recorder:
             writer.close()
             self._begin()
         if at_ns >= self._clean_up_ns:
-            self._clean_up_ns = at_ns + _CLEAN_UP_EVERY_NS
+            self._clean_up_ns = at_ns + self.clean_up_every_ns
             for path in self._retention.remove_oldest(self._part):
                 self._note("removed", file=path.name)
         lack = self._retention.lack_of_space()
@@ -150,6 +156,16 @@ class Recorder:
             with suppress(RecordingError):
                 writer.close()
         _tell(f"recording has stopped: {reason}")
+
+    def _keep_black_box(self, step: Callable[[], Path | None]) -> None:
+        """Let the black box look; what it cannot write is told, and the recording goes on."""
+        try:
+            path = step()
+        except RecordingError as error:
+            _tell(f"no black box: {error}")
+            return
+        if path is not None:
+            self._note("black_box", file=path.name)
 
     def _note(self, action: str, **detail: str) -> None:
         """Tell clients and the recording itself what becomes of it."""
@@ -170,9 +186,11 @@ class Recorder:
         while not signals:
             self._shared.beat("recorder", now_ns())
             self.drain()
+            self._keep_black_box(self._black_box.look)
             sleep(DRAIN_EVERY_S)
         outlast_loop(self._shared, parent_pid, self.drain)
         self.drain()
+        self._keep_black_box(self._black_box.close)
         lost = {
             "samples": self._samples.lost,
             "frames": self._frames.lost,

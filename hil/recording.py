@@ -56,7 +56,7 @@ class Recording:
             on; what stands before that point is here. Of several parts: samples are missing.
         part: Which part of which run the file is; of several, the first. None if the run has
             no parts.
-        parts: The files that were read.
+        parts: The files that were read; none if it was made in memory.
     """
 
     path: Path
@@ -65,8 +65,8 @@ class Recording:
     samples: Records
     events: tuple[RecordedEvent, ...]
     is_truncated: bool
-    part: Part | None
-    parts: tuple[Path, ...]
+    part: Part | None = None
+    parts: tuple[Path, ...] = ()
 
     @property
     def has_truth(self) -> bool:

@@ -161,10 +161,16 @@ class Replayer:
         config: The configuration of the run; another one shows what it would have changed.
 
     Raises:
-        ReplayError: If the recording has no frames or no samples.
+        ReplayError: If the recording has no frames or no samples, or begins in the midst of a run.
     """
 
     def __init__(self, recording: Recording, config: Config) -> None:
+        part = recording.part
+        if part is not None and part.number > 1:
+            raise ReplayError(
+                f"{recording.path} is part {part.number} of a run, and a replay needs its start: "
+                f"replay {part.first(recording.path)}, it goes on through the parts that follow"
+            )
         if not len(recording.samples) or next(iter(recording.frames()), None) is None:
             raise ReplayError(f"{recording.path} holds no cycles with bus frames to replay")
         self._recording = recording

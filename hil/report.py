@@ -24,7 +24,7 @@ from hil.metrics import (
     trajectory_rows,
 )
 from hil.plots import Span, draw_gain_surface, draw_run, draw_timing
-from hil.recording import RecordedEvent, Recording
+from hil.recording import Part, RecordedEvent, Recording
 from hil.region_report import manifold_section
 from hil.scenarios import SCENARIOS, Scenario
 
@@ -68,26 +68,34 @@ class ReportError(HilError):
 
 
 def write_report(recording_path: Path, out_dir: Path) -> Path:
+    """Write the report of one file; see `write_report_of`.
+
+    Raises:
+        RecordingError: If the recording cannot be read.
+        ReportError: As for `write_report_of`.
+    """
+    return write_report_of(Recording.open(recording_path), out_dir)
+
+
+def write_report_of(recording: Recording, out_dir: Path) -> Path:
     """Write `report.md`, `report.html` and their plots for a recording.
 
     The HTML file holds its images; the Markdown file refers to the PNG files beside it. If the
     recording names a reference scenario, its figures are held against the scenario's bounds.
 
     Args:
-        recording_path: MCAP file of a run.
+        recording: Of a run, or of a part of one.
         out_dir: Created if missing; files of an earlier report are replaced.
 
     Returns:
         The path of `report.html`.
 
     Raises:
-        RecordingError: If the recording cannot be read.
         ReportError: If it holds no samples, or `out_dir` cannot be written.
     """
-    recording = Recording.open(recording_path)
     if len(recording.samples) < 2:
         raise ReportError(
-            f"{recording_path} holds {len(recording.samples)} samples: nothing to report;"
+            f"{recording.path} holds {len(recording.samples)} samples: nothing to report;"
             " was the loop stopped before its first cycles?"
         )
     try:
@@ -107,6 +115,8 @@ def _blocks(recording: Recording, folder: Path) -> Iterator[Block]:
             "The recording ends early (its writer was killed) or is damaged from some point on;"
             " this report covers what is there."
         )
+    if recording.part is not None and (len(recording.parts) > 1 or recording.part.number > 1):
+        yield Paragraph(_parts(recording.part, len(recording.parts)))
     yield Heading("Figures")
     metrics: Metrics | None = None
     try:
@@ -130,6 +140,12 @@ def _blocks(recording: Recording, folder: Path) -> Iterator[Block]:
     yield from _timing(recording.samples, folder)
     yield Heading("Events")
     yield from _events(recording)
+
+
+def _parts(part: Part, count: int) -> str:
+    if count == 1:
+        return f"This is part {part.number} of a longer run; others have a report of their own."
+    return f"Parts {part.number} to {part.number + count - 1} of one run, read as one."
 
 
 def _setting(config: Mapping[str, Any], path: str) -> Any:  # noqa: ANN401 - JSON

@@ -39,8 +39,8 @@ class Retention:
         folder = self._first.parent
         try:
             space = os.statvfs(folder)
-        except OSError as error:
-            return f"{folder}: {error.strerror}"
+        except OSError:  # creating a file there will say what is wrong
+            return ""
         free_MB = space.f_bavail * space.f_frsize / MB
         if free_MB >= self._min_free_MB:
             return ""

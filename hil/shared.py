@@ -31,8 +31,8 @@ _CLOCK_MONOTONIC = 1
 _CHILDREN = ("loop", "gateway", "recorder")
 STATUS_EVERY_S: Final = 0.1
 """Period of the loop's status."""
-RING_S: Final = 8.0
-"""How far back the samples and bus frames reach."""
+RING_S: Final = 13.0
+"""How far back the samples and bus frames reach: the black box's 12 s, and time to take them."""
 FRAMES_AT_ONCE: Final = 16
 """Bus frames in one record, at most; fewer if they are CAN FD frames that nobody announced."""
 SLOTS: Final = 3

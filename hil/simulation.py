@@ -138,6 +138,11 @@ class Simulation:
         link = IdealArm(Arm(self.config.plant), self.config.loop.period_s)
         return link, link
 
+    @property
+    def plant(self) -> Emulator | IdealArm:
+        """What stands behind the frames: the plant's truth, as of the last cycle's start."""
+        return self._plant
+
     def step(self) -> None:
         """Run one cycle and record it."""
         start_ns = self._clock_ns

@@ -23,6 +23,8 @@ START_TIMEOUT_S = 30.0
 START_SAMPLES = 20
 """Cycles after which the amplifiers' state is known."""
 STOP_MARGIN_S = 3.0
+RECORDER_MARGIN_S = 10.0
+"""One that has just been started has to come up before it can write and end."""
 RESTART_PAUSE_S = 0.2
 RESTART_PAUSE_MAX_S = 10.0
 STEADY_S = 10.0
@@ -228,7 +230,7 @@ class Supervisor:
             if process.poll() is None:
                 process.terminate()
             try:
-                process.wait(STOP_MARGIN_S if name != "recorder" else START_TIMEOUT_S)
+                process.wait(STOP_MARGIN_S if name != "recorder" else RECORDER_MARGIN_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

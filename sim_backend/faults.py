@@ -6,12 +6,13 @@
 | `stuck` | reads what it last read | hangs: hears and says nothing | bridge hangs | process hangs |
 | `garbage` | reads any angle | any data in its frames | any frame instead | any frame instead |
 | `wrong` | reads `shift_rad` too much | torque with reversed sign | echo | echo |
-| `slow` | new reading every `hold_ms` | new torque every `hold_ms` | one frame a period | the same |
-| `delayed` | reads what was `hold_ms` ago | answers a period late | a period late | a period late |
-| `intermittent` | `off`, in parts of the time | hears and says nothing, in parts | nothing, in parts | the same |
+| `slow` | new one every `hold_ms` | new torque every `hold_ms` | one frame a period | the same |
+| `delayed` | reads what was `hold_ms` ago | answers a period late | a period late | the same |
+| `intermittent` | `off` at times | hears and says nothing at times | nothing at times | the same |
 
-A power stage keeps its last torque while its amplifier hangs, until the amplifier's own watchdog
-acts. A bridge, or a process, that hangs keeps frames back and lets them go in one burst at the
+Garbage on the bus has 29-bit identifiers, which hardly anybody listens to: the checksum of CAN
+lets no frame pass that is merely disturbed. A power stage keeps its last torque while its amplifier
+hangs, until the amplifier's own watchdog acts. A bridge, or a process, that hangs keeps frames back and lets them go in one burst at the
 end. An echo is the same frame a second time, one period later. `bus` acts in both directions,
 `host` on what the host sends. Faults of one target replace each other; those of different targets
 add up.
@@ -26,7 +27,7 @@ from collections.abc import Callable, Sequence
 from random import Random
 
 from drivers.fault_frame import FaultKind, FaultOrder, FaultTarget
-from drivers.frame import SFF_MASK, is_fd, pack_fd_frame, pack_frame, unpack_frame, unpack_header
+from drivers.frame import EFF_FLAG, is_fd, pack_fd_frame, pack_frame, unpack_frame, unpack_header
 from sim_backend.node import AmplifierNode, Transmit
 from sim_backend.servo import Servo
 from sim_backend.settings import FaultSettings
@@ -34,6 +35,7 @@ from sim_backend.settings import FaultSettings
 QUEUE_FRAMES = 32
 """So many frames wait at most where a fault keeps them back; the oldest are lost."""
 GARBAGE_RAD_S = 100.0
+_FAILED = (FaultTarget.AMPLIFIER, FaultKind.OFF)
 _TORQUE = (FaultKind.WRONG, FaultKind.SLOW)
 _ON_LINE = {
     FaultKind.STUCK: FaultKind.OFF,
@@ -117,7 +119,7 @@ class Line:
         can_id, data = unpack_frame(frame)
         data = self._random.randbytes(len(data))
         if not self._keeps_id:
-            can_id = self._random.randrange(SFF_MASK + 1)
+            can_id = EFF_FLAG | self._random.getrandbits(29)
         return pack_fd_frame(can_id, data) if is_fd(frame) else pack_frame(can_id, data)
 
 
@@ -356,9 +358,8 @@ class Faults:
         for (target, place), fault in list(self._active.items()):
             if fault.end is not None and period >= fault.end:
                 self._set(target, place, FaultKind.OK, 0)
-            elif fault.kind is FaultKind.OFF and target is FaultTarget.AMPLIFIER:
-                if self._servos[place].is_energised:
-                    self._nodes[place].fail_power_stage()
+            elif (target, fault.kind) == _FAILED and self._servos[place].is_energised:
+                self._nodes[place].fail_power_stage()
         self._begin_scheduled(period)
         self._interrupt()
 

@@ -14,6 +14,8 @@ from drivers.odrive.settings import OdriveSettings
 
 FORGIVEN_CYCLES = 10
 """After a reset, cycles within which a heartbeat may still tell of the old error."""
+NEVER = -2
+"""An age that feedback never has."""
 SETTLED_CYCLES = 2
 """A heartbeat sooner after the request of a state may have been sent before it."""
 VELOCITY_MAX_REV_S = 1e6
@@ -55,7 +57,7 @@ class OdriveAxis(Axis):
         self._is_preparing = False
         self._request_age = -1
         self._forgiven_cycles = 0
-        self._is_between_cycles = False
+        self._age_at_end = NEVER
         self._heartbeat_limit = math.ceil(3e-3 * settings.heartbeat_ms / period_s)
         self._heartbeat_age = 0
 
@@ -175,9 +177,13 @@ class OdriveAxis(Axis):
             codec.can_id(node, Command.TX_SDO): self._on_value,
         }
 
+    @property
+    def is_asked(self) -> bool:
+        """See `Axis.is_asked`: only with `feedback = "poll"`."""
+        return self._poll is not None
+
     def request(self) -> bytes | None:
         """Ask for the encoder, unless the drive sends it by its own clock."""
-        self._is_between_cycles = False
         return self._poll
 
     def command(self, tau_Nm: float) -> bytes:
@@ -241,7 +247,8 @@ class OdriveAxis(Axis):
 
     def end_cycle(self) -> None:
         """Count the silence since the last heartbeat."""
-        self._is_between_cycles = True
+        if self._poll is None:
+            self._age_at_end = self.age_cycles
         if self._request_age >= 0:
             self._request_age += 1
         if self._forgiven_cycles:
@@ -275,11 +282,12 @@ class OdriveAxis(Axis):
             self._base_rad = self._home(position_rev)
         self.q_rad = position_rev * self._rad_per_rev + self._base_rad
         self.dq_rad_s = velocity_rev_s * self._rad_per_rev
-        if self._is_between_cycles and self._poll is None:  # by the drive's clock: for the next
-            self.age_cycles = -1
+        if self.age_cycles == self._age_at_end:  # by the drive's clock, between cycles
+            self.age_cycles = self._age_at_end = -1
             return False
         is_first = self.age_cycles > 0
         self.age_cycles = 0
+        self._age_at_end = NEVER
         return is_first
 
     def _home(self, position_rev: float) -> float:

@@ -25,6 +25,7 @@ VERBS: Final = {
     "diff": "are two recordings the same run, and if not, where do they part",
     "replay": "a recording once more through drivers and controller, compared frame by frame",
     "doctor": "check host, bus and configuration",
+    "faults": "every fault on every target of every amplifier family, in virtual time",
     "conform": "drive one amplifier through its paces, pass or fail per step",
     "bus": "monitor, log and play frames; DBC and EDS",
 }

@@ -36,8 +36,6 @@ TORQUE_SHARE = 0.05
 """Torque of the steps if none is given, as a share of the axis's own limit."""
 LIMIT_FACTOR = 2.0
 """Torque limit of the run if none is given, times the torque of the steps."""
-TORQUE_STEPS_MIN = 20
-"""Least number of the drive's torque steps that the torque of the run has to be."""
 WATCHDOG_S = 0.1
 AnyAxis = TypeVar("AnyAxis", bound=AxisSettings)
 _WATCHDOG_SETTINGS = ("rpdo_timeout_ms", "watchdog_ms")

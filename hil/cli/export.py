@@ -4,20 +4,21 @@ import argparse
 import sys
 from pathlib import Path
 
+from hil.cli.options import add_recording
+from hil.cli.options import recording as opened
 from hil.errors import HilError
 from hil.export import export_csv
-from hil.recording import Recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the verb's options."""
-    parser.add_argument("recording", help="MCAP file")
+    add_recording(parser)
     parser.add_argument("--csv", metavar="FILE", required=True, help="- is standard output")
 
 
 def run(options: argparse.Namespace) -> int:
     """Write one row per cycle."""
-    recording = Recording.open(Path(options.recording))
+    recording = opened(options)
     if options.csv == "-":
         export_csv(recording, sys.stdout)
         return 0

@@ -2,11 +2,13 @@
 
 import argparse
 import os
+from pathlib import Path
 from typing import Any
 
 from hil.client import DEFAULT_ENDPOINT
 from hil.config import Config, load_config, merge, parse_assignment
 from hil.experiment import scenario_settings
+from hil.recording import Recording
 from hil.scenarios import find_scenario
 
 
@@ -60,6 +62,24 @@ def configuration(options: argparse.Namespace) -> Config:
     if options.bus is not None:
         over = merge(over, {"bus": {"address": options.bus}})
     return load_config(options.config, merge(over, assigned(options)))
+
+
+def add_recording(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which recording is meant."""
+    parser.add_argument("recording", help="MCAP file")
+    parser.add_argument(
+        "--whole-run", action="store_true", help="with the files that continue it (NAME-2.mcap ...)"
+    )
+
+
+def recording(options: argparse.Namespace) -> Recording:
+    """Open the recording the options ask for.
+
+    Raises:
+        RecordingError: If it cannot be read.
+    """
+    path = Path(options.recording)
+    return Recording.open_run(path) if options.whole_run else Recording.open(path)
 
 
 def add_connection(parser: argparse.ArgumentParser) -> None:

@@ -12,13 +12,13 @@ from hil.replay import Replayer
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the verb's options."""
-    parser.add_argument("recording", help="MCAP file")
+    parser.add_argument("recording", help="MCAP file; parts that continue it follow by themselves")
     add_assignments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Replay, and say how much came out again; 1 if anything differs."""
-    recording = Recording.open(Path(options.recording))
+    recording = Recording.open_run(Path(options.recording))
     table = merge(recording.config, assigned(options))
     result = Replayer(recording, config_from_json(json.dumps(table))).run()
     share = 100.0 * result.frames_equal / max(1, result.frames_sent)

@@ -3,18 +3,19 @@
 import argparse
 from pathlib import Path
 
-from hil.report import write_report
+from hil.cli.options import add_recording, recording
+from hil.report import write_report_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the verb's options."""
-    parser.add_argument("recording", help="MCAP file")
+    add_recording(parser)
     parser.add_argument("--out", metavar="DIR", help="default: beside the recording")
 
 
 def run(options: argparse.Namespace) -> int:
     """Write the report and print where it is."""
-    recording = Path(options.recording)
-    out = Path(options.out) if options.out else recording.with_suffix("")
-    print(write_report(recording, out))
+    path = Path(options.recording)
+    out = Path(options.out) if options.out else path.with_suffix("")
+    print(write_report_of(recording(options), out))
     return 0

@@ -20,7 +20,7 @@ COMMANDABLE = frozenset(
     (Mode.STOPPED, Mode.CURRENT, Mode.POSITION, Mode.TIMEOUT, Mode.ZERO_VELOCITY, Mode.BRAKE)
 )
 """Modes that can be written here; a real controller has more, none of them needed for torque."""
-_WATCHED = (Mode.POSITION,)
+_WITHOUT_POWER = frozenset((Mode.STOPPED, Mode.FAULT))
 _POWERED = frozenset((Mode.CURRENT, Mode.POSITION, Mode.ZERO_VELOCITY, Mode.BRAKE))
 _TO_POWER = frozenset((Mode.ENABLING, Mode.CALIBRATING, Mode.CALIBRATION_COMPLETE))
 
@@ -152,13 +152,19 @@ class Controller:
     def tick(self, dt_s: float) -> None:
         """Let time pass: enabling, the watchdog, the position loop."""
         self.position_rev()
+        self._age_s += dt_s
+        if self.mode in _WITHOUT_POWER:
+            return
         if self.mode in _TO_POWER:
             self._step_enabling(dt_s)
-        self._age_s += dt_s
-        if self.mode in _WATCHED and self._is_overdue():
-            self.mode = Mode.TIMEOUT
-        if self.mode == Mode.POSITION:
-            self._target_rev += _finite(self.command.velocity_rev_s) * dt_s
+        elif self.mode == Mode.POSITION:
+            command = self.command
+            if self._is_overdue():
+                self.mode = Mode.TIMEOUT
+            elif not (command.kp_scale or command.kd_scale):
+                return  # torque alone: it does not change with time
+            else:
+                self._target_rev += _finite(command.velocity_rev_s) * dt_s
         self._apply()
 
     def _step_enabling(self, dt_s: float) -> None:

@@ -24,7 +24,7 @@ from drivers.buses.python_can import PythonCanBus
 from drivers.buses.socketcan import SocketCanBus
 from drivers.buses.unix import UnixBus
 from drivers.errors import BusAddressError, BusError
-from drivers.frame import EFF_FLAG, RTR_FLAG, pack_frame, unpack_frame
+from drivers.frame import EFF_FLAG, RTR_FLAG, pack_fd_frame, pack_frame, unpack_frame
 
 WAIT_S = 5.0
 NETWORK = Path("/sys/class/net")
@@ -316,6 +316,21 @@ def test_socketcan__interface_down__says_how_to_raise_it(own_vcan):
     subprocess.run(["ip", "link", "set", own_vcan, "down"], check=True)
     with pytest.raises(BusError, match=f"is down; `ip link set {own_vcan} up`"):
         SocketCanBus(own_vcan)
+
+
+def test_socketcan__interface_for_classic_frames__tells_and_refuses_can_fd(own_vcan):
+    if own_vcan is None:
+        pytest.skip("not allowed to make a vcan interface")
+    with SocketCanBus(own_vcan) as bus:
+        assert bus.carries_fd
+    for change in (["down"], ["mtu", "16"], ["up"]):
+        subprocess.run(["ip", "link", "set", own_vcan, *change], check=True)
+    with SocketCanBus(own_vcan) as bus:
+        assert not bus.carries_fd
+        with pytest.raises(BusError, match=f"{own_vcan} is not set up for CAN FD frames") as caught:
+            bus.send(pack_fd_frame(1, bytes(12)))
+        assert "\n" not in str(caught.value)
+        assert bus.send(pack_frame(1)) is True
 
 
 def test_socketcan__interface_removed_in_use__is_a_bus_error(own_vcan):

@@ -1,5 +1,8 @@
 """Frames in files: every format and back, foreign readers, broken files."""
 
+import struct
+import zlib
+
 import can
 import pytest
 from hypothesis import given, settings
@@ -89,6 +92,21 @@ def test_log__damaged_file__frames_or_one_error(tmp_path_factory, suffix, cut, c
     except FrameLogError as error:
         refusals.append(str(error))
     assert all(str(path) in text and "\n" not in text for text in refusals)
+
+
+def test_log__blf_object_without_size__refused_instead_of_standing_still(tmp_path):
+    """python-can's reader would look at the same object for ever."""
+    path = written(tmp_path / "x.blf", FRAMES)
+    content = path.read_bytes()
+    start = content.index(b"LOBJ") + 32  # file header, then one container: its head and kind
+    objects = bytearray(zlib.decompress(content[start:]))
+    objects[6:12] = b"\x05\x00" + bytes(4)  # unknown version of the first object's head, no size
+    container = zlib.compress(bytes(objects))
+    head = bytearray(content[:start])
+    struct.pack_into("<I", head, start - 24, 32 + len(container))
+    path.write_bytes(bytes(head) + container + bytes(len(container) % 4))
+    with pytest.raises(FrameLogError, match="an object of 0 bytes"):
+        list(read_log(path))
 
 
 def test_close__twice__nothing_happens(tmp_path):

@@ -415,6 +415,29 @@ def test_feedback__cyclic_between_two_cycles__counts_for_the_next():
     assert rig.bus.age_cycles == 1
 
 
+def test_feedback__cyclic_and_a_cycle_without_requests__each_frame_counts_once():
+    """The bus leaves requests out when it looks for late answers of others."""
+    axis = lone_axis(feedback="cyclic")
+    frame = pack_frame(0x029, codec.F32_PAIR.pack(0.1, 0.0))
+    axis.end_cycle()
+    ages = []
+    for comes in (True, True, False, False, True):
+        axis.age_cycles += 1
+        if comes:
+            tell(axis, frame)
+        ages.append(axis.age_cycles)
+        axis.end_cycle()
+    assert ages == [0, 0, 1, 2, 0]
+    tell(axis, frame)
+    tell(axis, frame)
+    axis.age_cycles += 1
+    assert axis.age_cycles == 0
+    assert not tell(axis, frame)
+    axis.end_cycle()
+    axis.age_cycles += 1
+    assert axis.age_cycles == 1, "a frame is not fresh twice"
+
+
 # --- state --------------------------------------------------------------------------------------
 
 

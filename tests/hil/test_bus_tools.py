@@ -22,7 +22,7 @@ from hil.bus_tools import BusToolError, Monitor, frames_of, is_virtual, play
 from hil.cli import main
 from sim_backend.hub import UnixHub
 from tests.drivers.conftest import RunningHub
-from tests.hil.lab import HilProcess, one_line, wait_until
+from tests.hil.lab import one_line, wait_until
 
 AXES = [Cia402Settings(node_id=1, rated_torque_Nm=5.0, torque_max_Nm=15.0)]
 HEARTBEAT = pack_frame(0x701, b"\x7f")
@@ -223,9 +223,9 @@ def test_bus_eds__as_written__read_by_canopen(capsys):
     )
 
 
-def test_bus_log__as_a_process__python_can_reads_what_was_on_the_bus(hub, tmp_path):
+def test_bus_log__as_a_process__python_can_reads_what_was_on_the_bus(hub, tmp_path, lab):
     path = tmp_path / "x.asc"
-    process = HilProcess(tmp_path, "bus", "log", str(path), "--bus", hub.address)
+    process = lab.start("bus", "log", str(path), "--bus", hub.address)
     assert process.wait_for_line() == f"logging {hub.address} to {path}"
     with open_bus(hub.address) as sender:
         for frame in (HEARTBEAT, FEEDBACK):
@@ -237,8 +237,8 @@ def test_bus_log__as_a_process__python_can_reads_what_was_on_the_bus(hub, tmp_pa
         assert [m.arbitration_id for m in reader] == [0x701, 0x181]
 
 
-def test_bus_monitor__as_a_process__lines_until_the_signal(hub, tmp_path):
-    process = HilProcess(tmp_path, "bus", "monitor", "--every", "0", "--bus", hub.address)
+def test_bus_monitor__as_a_process__lines_until_the_signal(hub, lab):
+    process = lab.start("bus", "monitor", "--every", "0", "--bus", hub.address)
     with open_bus(hub.address) as sender:
 
         def is_following():
@@ -253,8 +253,8 @@ def test_bus_monitor__as_a_process__lines_until_the_signal(hub, tmp_path):
     assert all(earlier <= later for earlier, later in pairwise(times))
 
 
-def test_bus_monitor__emulator_goes__one_line_and_status_1(hub, tmp_path):
-    process = HilProcess(tmp_path, "bus", "monitor", "--raw", "--bus", hub.address)
+def test_bus_monitor__emulator_goes__one_line_and_status_1(hub, lab):
+    process = lab.start("bus", "monitor", "--raw", "--bus", hub.address)
     with open_bus(hub.address) as sender:
 
         def is_following():
@@ -267,11 +267,11 @@ def test_bus_monitor__emulator_goes__one_line_and_status_1(hub, tmp_path):
     assert "the emulator has closed it" in one_line(process)
 
 
-def test_bus_play__as_a_process__others_hear_the_log(hub, tmp_path):
+def test_bus_play__as_a_process__others_hear_the_log(hub, tmp_path, lab):
     path = tmp_path / "x.log"
     path.write_text("(5.000000) can0 201#0F001E00\n(5.050000) can0 080#\n")
     with open_bus(hub.address) as listener:
-        process = HilProcess(tmp_path, "bus", "play", str(path), "--bus", hub.address)
+        process = lab.start("bus", "play", str(path), "--bus", hub.address)
         assert process.wait() == 0, process.stderr
         heard = [unpack_frame(listener.recv(5.0)) for _ in range(2)]
     assert heard == [(0x201, b"\x0f\x00\x1e\x00"), (0x080, b"")]

@@ -26,7 +26,7 @@ from hil.conform_steps import STEPS
 from hil.emulation import build_emulator
 from sim_backend.hub import UnixHub
 from sim_backend.server import EmulatorServer
-from tests.hil.lab import HilProcess, wait_until
+from tests.hil.lab import wait_until
 
 STALL_S = 0.1
 TPDO = codec.COB_TPDO1 + 1
@@ -290,6 +290,15 @@ def test_kit__scales_differ__start_up_fails_and_nothing_is_driven():
     assert not [f for f in sent if unpack_frame(f)[0] == codec.COB_RPDO1 + 1]
 
 
+def test_kit__torque_of_a_few_steps__start_up_fails_with_the_least():
+    limits = Limits(torque_Nm=0.05, torque_max_Nm=1.5, watchdog_s=0.02)
+    with emulation() as running:
+        results = run_kit(running, limits)
+        assert not running.node.drive.machine.is_powered
+    assert failed(results) == ["start-up"]
+    assert "use --torque 0.1 or more" in results["start-up"].detail
+
+
 def test_kit__feedback_ends__torque_off_is_asked_for():
     lost = threading.Event()
 
@@ -375,10 +384,10 @@ def test_conform__every_other_family__passes_what_it_can_be_asked(capsys, family
     assert "pass         loss of master " in out
 
 
-def test_conform__as_a_process__steps_frames_log_and_status_0(running, tmp_path):
+def test_conform__as_a_process__steps_frames_log_and_status_0(running, tmp_path, lab):
     log = tmp_path / "run.asc"
-    process = HilProcess(
-        tmp_path, "conform", "cia402", "--bus", running.address, "--frames", "--log", str(log),
+    process = lab.start(
+        "conform", "cia402", "--bus", running.address, "--frames", "--log", str(log),
         "--set", f"emulator.stall_timeout_s={STALL_S}",
     )  # fmt: skip
     assert process.wait() == 0, process.stdout + process.stderr
@@ -392,9 +401,9 @@ def test_conform__as_a_process__steps_frames_log_and_status_0(running, tmp_path)
     assert {0x000, 0x080, TPDO, codec.COB_RPDO1 + 1} <= identifiers
 
 
-def test_conform__json__machine_readable(running, tmp_path):
-    process = HilProcess(
-        tmp_path, "conform", "cia402", "--joint", "2", "--bus", running.address, "--json",
+def test_conform__json__machine_readable(running, lab):
+    process = lab.start(
+        "conform", "cia402", "--joint", "2", "--bus", running.address, "--json",
         "--set", f"emulator.stall_timeout_s={STALL_S}",
     )  # fmt: skip
     assert process.wait() == 0, process.stdout + process.stderr
@@ -404,10 +413,10 @@ def test_conform__json__machine_readable(running, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_conform__interrupted__torque_is_off(running, tmp_path, number):
+def test_conform__interrupted__torque_is_off(running, number, lab):
     """While the drive is under power: it is disabled before the process ends."""
-    process = HilProcess(
-        tmp_path, "conform", "cia402", "--bus", running.address,
+    process = lab.start(
+        "conform", "cia402", "--bus", running.address,
         "--set", "emulator.stall_timeout_s=5",
     )  # fmt: skip
     wait_until(lambda: "pass         enable " in process.stdout, what="the enabled drive")

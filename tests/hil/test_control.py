@@ -105,7 +105,8 @@ def test_feedback__one_frame_lost_now_and_then__age_tells_and_no_value_poses_as_
         counts.append(rig.bus.age_cycles)
         if drop:
             assert rig.bus.axes[1].q_rad == before
-    assert counts == [1, 0, 0] * 20
+    assert counts[:3] == [1, 0, 1]  # the first gap is followed by a probe, in which nobody is asked
+    assert counts[6:48] == [1, 0, 0] * 14  # and others only after a while
     assert rig.state is State.ACTIVE
 
 
@@ -144,6 +145,35 @@ def trip_by(rig, code, cycles=2000):
     return fault
 
 
+def lead_to(rig, joint, q_rad, speed_rad_s=0.3):
+    """Play a reference that nobody has checked: one joint goes to an angle at a constant rate."""
+    start = list(rig.control.player.setpoint.q_rad)
+    samples = 2 + round(abs(q_rad - start[joint]) / speed_rad_s / 1e-3)
+    q = np.tile(np.array(start), (samples, 1))
+    q[:, joint] = np.linspace(start[joint], q_rad, samples)
+    rig.play(Reference(q, np.zeros_like(q), np.zeros_like(q), 1e-3))
+
+
+def test_position__enabled_outside_soft_limit__may_come_back_and_no_further_out():
+    rig = Rig("plant.q0_rad=[0.35, 0.0]", "controller.limits.q_max_rad=[0.3, 2.8]")
+    rig.enable()
+    lead_to(rig, 0, 0.2)
+    for _ in range(3000):
+        rig.step()
+        assert rig.fault is FaultCode.NONE
+    assert rig.control.q_rad[0] < 0.25
+    lead_to(rig, 0, 0.36)
+    assert trip_by(rig, FaultCode.POSITION_SOFT)["limit"] == 0.3
+
+
+def test_position__enabled_outside_soft_limit__pushed_out__damped_stop():
+    rig = Rig("plant.q0_rad=[0.35, 0.0]", "controller.limits.q_max_rad=[0.3, 2.8]")
+    rig.enable()
+    lead_to(rig, 0, 0.5, speed_rad_s=0.1)
+    trip_by(rig, FaultCode.POSITION_SOFT)
+    assert rig.control.q_rad[0] < 0.4  # within the hard limit
+
+
 def test_position__beyond_hard_limit__torque_off_with_joint_value_limit():
     rig = Rig("plant.q0_rad=[0.0, -0.5]", "controller.limits.q_min_rad=[-2.8, -0.3]")
     rig.control.enable()
@@ -154,8 +184,9 @@ def test_position__beyond_hard_limit__torque_off_with_joint_value_limit():
 
 
 def test_position__beyond_soft_limit__damped_stop():
-    rig = Rig("plant.q0_rad=[0.35, 0.0]", "controller.limits.q_max_rad=[0.3, 2.8]")
-    rig.control.enable()
+    rig = Rig("plant.q0_rad=[0.25, 0.0]", "controller.limits.q_max_rad=[0.3, 2.8]")
+    rig.enable()
+    lead_to(rig, 0, 0.39)
     fault = trip_by(rig, FaultCode.POSITION_SOFT)
     assert (fault["joint"], fault["limit"]) == (1, 0.3)
 

@@ -83,6 +83,7 @@ def test_replay__simulated_run__every_frame_and_sample_again(tmp_path, middle):
         {"controller": {"law": {"name": "slotine_li"}}},
         {"emulator": {"wire": {"is_on": True}}},
         {"axes": {"2": {"family": "odrive"}}},
+        {"axes": {"1": {"family": "moteus"}, "2": {"family": "moteus"}}},
     ],
     ids=str,
 )

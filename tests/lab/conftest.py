@@ -76,7 +76,11 @@ class Tool:
 
     def __exit__(self, *_):
         self.process.terminate()
-        self.process.wait(10)
+        try:
+            self.process.wait(10)
+        except subprocess.TimeoutExpired:  # slcand waits for its line to drain
+            self.process.kill()
+            self.process.wait()
 
 
 class Bench:
