@@ -1,7 +1,10 @@
 """Samples: written as one struct against protobuf's own serialiser, and their way into MCAP."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
+
+from mcap.writer import Writer
 
 from benchmarks import rig
 from benchmarks.measure import (
@@ -16,6 +19,7 @@ from benchmarks.measure import (
     title,
     us,
 )
+from hil.mcap_writer import McapWriter
 from hil.proto import telemetry_pb2
 from hil.recording import RecordingWriter
 from hil.simulation import open_recording
@@ -47,6 +51,10 @@ def run(scale: float) -> list[Target]:
     ):
         bodies = _recorders(layout, values, recording, other)
         _print("serialise and write into MCAP", alternate(bodies, turns=turns, calls=CALLS))
+    row("", "ours p50", "ours p99", "mcap p50", "mcap p99", "mcap/ours")
+    with rig.scratch_file("ours.mcap") as ours, rig.scratch_file("plain.mcap") as plain:
+        files = _files(ours, plain, _sample(layout, values))
+        _print("write one message", _per_sample(alternate(files, turns=turns, calls=4)))
     return []
 
 
@@ -55,6 +63,27 @@ def _print(label: str, samples: Samples) -> None:
     for name in ("ours", "pb"):
         cells += [us(median(samples[name])), us(percentile(samples[name], 0.99))]
     row(label, *cells, times(ratio(samples, "pb", "ours")))
+
+
+def _files(ours: Path, plain: Path, payload: bytes) -> dict[str, Callable[[], object]]:
+    """Write a batch of messages and flush it, with our writer and with the library's own."""
+    mine, theirs = McapWriter(ours.open("wb")), Writer(str(plain))
+    for writer in (mine, theirs):
+        writer.start(library="hil")
+        schema = writer.register_schema("hil.v1.Sample", "protobuf", b"")
+        writer.register_channel("telemetry", "protobuf", schema)
+
+    def write_ours() -> None:
+        for seq in range(BATCH):
+            mine.add_message(1, seq, payload, seq)
+        mine.flush()
+
+    def write_theirs() -> None:
+        for seq in range(BATCH):
+            theirs.add_message(1, seq, payload, seq, seq)
+        theirs.flush()
+
+    return {"ours": write_ours, "pb": write_theirs}
 
 
 def _per_sample(samples: Samples) -> Samples:

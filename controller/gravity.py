@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from controller.settings import LimitSettings, ModelSettings
 
-_FULL_SHARE = 0.1
+_FULL_SHARE = 0.04
 """Of the torque limit: with a gravity torque above this share, a joint is let down at full rate."""
 
 

@@ -4,6 +4,8 @@ Run it as `.venv/bin/python docs/generate.py` when a setting, an option or a mes
 `tests/hil/test_docs.py` says when that is due.
 """
 
+# ruff: noqa: SLF001, ANN401 - argparse tells of itself in private, annotations are of any type
+
 import argparse
 import json
 import re
@@ -121,7 +123,7 @@ def bounds_of(field: FieldInfo) -> str:
     for constraint in field.metadata:
         for name, words in SIGNS.items():
             if getattr(constraint, name, None) is not None:
-                found.append(f"{words} {getattr(constraint, name):g}")
+                found.append(f"{words} {json.dumps(getattr(constraint, name))}")
     return ", ".join(found)
 
 
@@ -148,12 +150,14 @@ def settings(path: str, model: type[BaseModel], title: str = "") -> Iterator[str
 def configuration() -> Iterator[str]:
     """Yield the page of all settings."""
     yield from head("Configuration", """
-One TOML file; what it leaves out comes from the arm preset (`arm.preset`) and from the defaults below. Command line over
-environment over file over default: `--set loop.cpu=1` wins over `HIL_LOOP__CPU=1`. Lists have one entry per joint,
-shoulder first; one entry of a list of tables is `axes.2.node_id`. `deploy/bench.toml` is an example with comments. What
-cannot be is refused in one line with the setting, the value and the reason; an unknown setting is refused, too.
+One TOML file; what it leaves out comes from the arm preset (`arm.preset`) and from the defaults
+below. Command line over environment over file over default: `--set loop.cpu=1` wins over
+`HIL_LOOP__CPU=1`. Lists have one entry per joint, shoulder first; one entry of a list of tables is
+`axes.2.node_id`. `deploy/bench.toml` is an example with comments. What cannot be is refused in one
+line with the setting, the value and the reason; an unknown setting is refused, too.
 
-The `controller` table has [a page of its own](../configuration.md). A default "preset" is the arm preset's.
+The `controller` table has [a page of its own](../configuration.md). A default "preset" is the arm
+preset's. A list that is empty by default shows its tables as entry 1.
 """)  # fmt: skip
     rows = []
     for name, field in Config.model_fields.items():
@@ -212,8 +216,8 @@ def verb_sections(name: str, parser: argparse.ArgumentParser, summary: str) -> I
 def command_line() -> Iterator[str]:
     """Yield the page of all verbs and options."""
     yield from head("Command line", """
-Exit status: 0 done, 1 refused or failed (one line on stderr), 2 usage, 130 interrupted. `hil VERB --help` says the
-same as this page.
+Exit status: 0 done, 1 refused or failed (one line on stderr), 2 usage, 130 interrupted. `hil VERB
+--help` says the same as this page.
 """)  # fmt: skip
     parser = make_parser()
     (verbs,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
@@ -280,8 +284,8 @@ def proto_message(name: str, text: str) -> Iterator[str]:
 def keys_and_messages() -> Iterator[str]:
     """Yield the page of all keys and what travels on them."""
     yield from head("Zenoh keys and messages", """
-All keys are below `hil/ARM/`, ARM being `arm.name`. `hil.client` is a client in Python; this page is for all others, and
-`hil/ARM/schema` answers it to programs.
+All keys are below `hil/ARM/`, ARM being `arm.name`. `hil.client` is a client in Python; this page
+is for all others, and `hil/ARM/schema` answers it to programs.
 """)  # fmt: skip
     yield "## Streams"
     yield ""
@@ -297,8 +301,8 @@ All keys are below `hil/ARM/`, ARM being `arm.name`. `hil.client` is a client in
     yield "## Requests and the reply"
     yield ""
     yield (
-        "JSON objects; SI units, angles in rad, lists have one entry per joint, shoulder first. A field"
-        " that is not known is refused. A refusal has changed nothing."
+        "JSON objects; SI units, angles in rad, lists have one entry per joint, shoulder first. A"
+        " field that is not known is refused. A refusal has changed nothing."
     )
     yield ""
     for name, schema in known.items():
@@ -309,9 +313,10 @@ All keys are below `hil/ARM/`, ARM being `arm.name`. `hil.client` is a client in
     yield "## Telemetry and recordings"
     yield ""
     yield (
-        "The contract is `hil/proto/telemetry.proto`. Every field has a fixed size on the wire; lists have"
-        " one entry per joint. A recording is MCAP with the channels `telemetry` (Sample), `bus` (BusLog)"
-        " and `event` (Event), the metadata `config`, and played references as attachments."
+        "The contract is `hil/proto/telemetry.proto`. Every field has a fixed size on the wire;"
+        " lists have one entry per joint. A recording is MCAP with the channels `telemetry`"
+        " (Sample), `bus` (BusLog) and `event` (Event), the metadata `config`, and played"
+        " references as attachments."
     )
     yield ""
     text = (ROOT / "hil" / "proto" / "telemetry.proto").read_text(encoding="utf-8")

@@ -5,28 +5,17 @@ gain that is clipped to the self-tuned law's peak torque needs that peak first, 
 in a second round.
 """
 
-import os
-import signal
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from itertools import product
-from multiprocessing import get_context
 from time import process_time
 from types import MappingProxyType
 from typing import Any, Final
 
-import numpy as np
-
+from hil.batch import FAILURES, FIGURES, BatchError, Workers, simulate
 from hil.config import Config, load_config, merge
 from hil.errors import HilError
-from hil.experiment import Memory, play_in_simulation
 from hil.messages import KellyRequest
-from hil.metrics import MetricsError, measure
-from hil.planner import Refusal
-from hil.realtime import die_with_parent
-from hil.simulation import SimulationError
 from sim_backend.perturbation import (
     scaled,
     with_backlash,
@@ -180,9 +169,6 @@ class Row:
     cpu_s: float = field(default=0.0, compare=False)
 
 
-FIGURES: Final = tuple(name for name in Row.__slots__ if name not in ("case", "failed", "cpu_s"))
-
-
 def select(names: Sequence[str] | None, known: Mapping[str, Any], what: str) -> list[str]:
     """Return the chosen names, all of them if none is chosen.
 
@@ -221,29 +207,14 @@ def run_case(case: Case) -> Row:
     began_s = process_time()
     _, rate = SCENARIOS[case.scenario]
     request = KellyRequest(duration_s=DURATION_S, rate=rate, approach="none")
-    config = configure(case)
-    memory = Memory(config.joints)
     try:
-        play_in_simulation(config, request, memory)
-        samples = memory.samples()
-        metrics = measure(samples, stat_start_s=STAT_START_S, end_s=DURATION_S)
-    except (SimulationError, Refusal, MetricsError) as error:
+        figures = simulate(
+            configure(case), request, stat_start_s=STAT_START_S, end_s=DURATION_S
+        )
+    except FAILURES as error:
         return Row(case, failed=str(error), cpu_s=process_time() - began_s)
-    effort = np.sqrt(np.mean(samples["tau_sent_Nm"] ** 2, axis=0))
-    tracking = metrics.true or metrics.measured
-    return Row(
-        case,
-        rms_counts=tracking.rms_counts,
-        peak_counts=tracking.peak_counts,
-        ts20_s=tracking.ts20_s,
-        rate10_1_s=metrics.rate10_1_s,
-        peak_tau_Nm=metrics.peak_tau_Nm,
-        effort_Nm=tuple(effort.tolist()),
-        tv_Nm_s=metrics.tv_Nm_s,
-        Kd_min=metrics.Kd_min,
-        Kd_max=metrics.Kd_max,
-        cpu_s=process_time() - began_s,
-    )
+    values = {name: getattr(figures, name) for name in FIGURES}
+    return Row(case, **values, cpu_s=process_time() - began_s)
 
 
 def compare(
@@ -268,28 +239,17 @@ def compare(
     first = list(
         dict.fromkeys([*(c for c in wanted if c.law != CLIPPED), *map(_unclipped, clipped)])
     )
-    spawn = get_context("spawn")
-    pool = ProcessPoolExecutor(processes, spawn, _begin_worker, (os.getpid(),))
     try:
-        rows = _run_all(pool, first, on_row, known)
-        second = {
-            case: replace(case, tau_clip_Nm=rows[_unclipped(case)].peak_tau_Nm or None)
-            for case in clipped
-        }
-        late = _run_all(pool, list(second.values()), on_row, known)
-    except BrokenProcessPool as error:
-        raise CompareError(
-            "a run's process was killed; is there memory for all of them?"
-        ) from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        with Workers(processes) as workers:
+            rows = _run_all(workers, first, on_row, known)
+            second = {
+                case: replace(case, tau_clip_Nm=rows[_unclipped(case)].peak_tau_Nm or None)
+                for case in clipped
+            }
+            late = _run_all(workers, list(second.values()), on_row, known)
+    except BatchError as error:
+        raise CompareError(str(error)) from error
     return [late[second[case]] if case in second else rows[case] for case in wanted]
-
-
-def _begin_worker(parent_pid: int) -> None:
-    """Leave an interruption to the parent, which ends the pool; go when the parent has gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    die_with_parent(parent_pid)
 
 
 def _unclipped(case: Case) -> Case:
@@ -297,15 +257,10 @@ def _unclipped(case: Case) -> Case:
 
 
 def _run_all(
-    pool: ProcessPoolExecutor,
+    workers: Workers,
     some: Sequence[Case],
     on_row: Callable[[Row], object],
     known: Mapping[Case, Row],
 ) -> dict[Case, Row]:
     rows = {case: known[case] for case in some if case in known}
-    waiting = [pool.submit(run_case, case) for case in some if case not in known]
-    for done in as_completed(waiting):
-        row = done.result()
-        on_row(row)
-        rows[row.case] = row
-    return rows
+    return rows | workers.run(run_case, [case for case in some if case not in known], on_row)

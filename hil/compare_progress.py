@@ -2,24 +2,14 @@
 
 import json
 from dataclasses import asdict
-from hashlib import sha256
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from hil.batch import fingerprint
 from hil.compare import Case, Row
 
 FILE_NAME: Final = "unfinished.jsonl"
-_ROOMS: Final = ("controller", "drivers", "hil", "sim_backend")
-
-
-def fingerprint() -> str:
-    """Return a digest of the program's own sources, whose rows alone can be gone on with."""
-    root = Path(__file__).parents[1]
-    digest = sha256()
-    for path in sorted(path for room in _ROOMS for path in (root / room).rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
 
 
 class Progress:

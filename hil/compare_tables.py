@@ -5,7 +5,8 @@ import io
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from hil.compare import FIGURES, Row
+from hil.batch import FIGURES, figure_columns
+from hil.compare import Row
 
 
 def to_csv(rows: Sequence[Row]) -> str:
@@ -13,23 +14,12 @@ def to_csv(rows: Sequence[Row]) -> str:
     joints = max((len(row.rms_counts) for row in rows), default=0)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    names = [f"{_split_unit(name, j)}" for name in FIGURES for j in range(1, joints + 1)]
-    writer.writerow(["law", "scenario", "perturbation", "failed", *names])
+    writer.writerow(["law", "scenario", "perturbation", "failed", *figure_columns(joints)])
     for row in rows:
         values = [v for name in FIGURES for v in _padded(getattr(row, name), joints)]
         case = row.case
         writer.writerow([case.law, case.scenario, case.perturbation, row.failed, *values])
     return stream.getvalue()
-
-
-def _split_unit(name: str, joint: int) -> str:
-    """`rms_counts` -> `rms_1_counts`, as in exported recordings; names without unit get it last."""
-    stem, _, unit = name.partition("_")
-    if name in ("Kd_min", "Kd_max"):
-        return f"{name}_{joint}"
-    if stem == "peak" and unit.startswith("tau"):
-        return f"peak_tau_{joint}_Nm"
-    return f"{stem}_{joint}_{unit}"
 
 
 def _padded(values: tuple[float, ...], joints: int) -> list[float | str]:

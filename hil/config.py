@@ -59,11 +59,11 @@ class BusSettings(_Settings):
 class LoopSettings(_Settings):
     """The control loop's timing and rights."""
 
-    period_s: float = Field(1e-3, ge=1e-3, le=10e-3)
+    period_s: float = Field(1e-3, ge=1e-3, le=10e-3, description="of the control cycle")
     realtime: Literal["required", "best_effort", "off"] = Field(
         "required", description="SCHED_FIFO, locked memory; `required` fails when not granted"
     )
-    priority: int = Field(80, ge=1, le=98)
+    priority: int = Field(80, ge=1, le=98, description="of SCHED_FIFO")
     cpu: int | None = Field(None, ge=0, description="core to run on; none = any")
     feedback_timeout_s: float = Field(
         0.6e-3, gt=0, description="after the start of a cycle; later feedback is missing"
@@ -71,7 +71,9 @@ class LoopSettings(_Settings):
     lockstep_timeout_s: float = Field(
         1.0, gt=0, description="the same for emulated amplifiers in lockstep, whose time waits"
     )
-    enable_timeout_s: float = Field(1.0, gt=0)
+    enable_timeout_s: float = Field(
+        1.0, gt=0, description="amplifiers that are not on after this are a fault"
+    )
     on_gateway_loss: Literal["finish", "hold", "stop"] = Field(
         "finish", description="finish: the trajectory, then hold; hold: slow down now; stop: damped"
     )
@@ -80,25 +82,31 @@ class LoopSettings(_Settings):
 class TrajectorySettings(_Settings):
     """What may be sent as one trajectory."""
 
-    max_duration_s: float = Field(120.0, gt=0, le=3600)
+    max_duration_s: float = Field(
+        120.0, gt=0, le=3600, description="longer ones are refused; sizes the shared memory"
+    )
 
 
 class ZenohSettings(_Settings):
     """How clients reach the daemon."""
 
-    mode: Literal["peer", "client", "router"] = "peer"
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    connect: tuple[str, ...] = ()
-    multicast_scouting: bool = False
+    mode: Literal["peer", "client", "router"] = Field(
+        "peer", description="client: through the router in `connect` alone"
+    )
+    listen: tuple[str, ...] = Field(
+        ("tcp/127.0.0.1:7447",), description="endpoints of this daemon; loopback only by default"
+    )
+    connect: tuple[str, ...] = Field((), description="endpoints of routers or peers to join")
+    multicast_scouting: bool = Field(False, description="look for others on the local network")
 
 
 class RecordingSettings(_Settings):
     """Where runs are recorded, and how much of the disk they may take."""
 
-    directory: str = "runs"
-    is_enabled: bool = True
-    max_size_MB: float = Field(1000.0, gt=0, description="10^6 bytes; then a new file begins")
-    max_age_s: float = Field(3600.0, gt=0, description="likewise")
+    directory: str = Field("runs", description="of recordings that are not named by `--record`")
+    is_enabled: bool = Field(True, description="`--record FILE` records all the same")
+    max_size_MB: float = Field(1000.0, gt=0, description="of a file; then the next one begins")
+    max_age_s: float = Field(3600.0, gt=0, description="of a file; then the next one begins")
     disk_budget_MB: float | None = Field(
         None, gt=0, description="of all of the arm's recordings; the oldest are removed; none = all"
     )

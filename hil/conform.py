@@ -19,6 +19,8 @@ FRAMES_KEPT = 20_000
 """Frames of one step that are kept; more are counted only."""
 MISSING_LIMIT = 50
 """Cycles in a row without feedback after which a step gives up and takes torque off."""
+STALL_PERIODS = 5
+"""A host that is late by more than this cannot judge a drive."""
 REPEATS = 2
 """How often a step is repeated that failed while this host itself stood still."""
 POWER_DOWN_CYCLES = 100
@@ -342,12 +344,12 @@ def run_steps(
 
 def _run_step(bench: Bench, step: Step) -> StepResult:
     """Run one step, again if it failed while this host stood still for longer than is fair."""
-    note = ""
+    note, was_set_up = "", bench.info is not None
     for attempt in range(REPEATS + 1):
         bench.begin_step()
         outcome, detail = _attempt(bench, step)
-        stalled = bench.stall_s > 0.5 * bench.limits.watchdog_s
-        if outcome is not Outcome.FAIL or not stalled or step.is_vital or attempt == REPEATS:
+        stalled = bench.stall_s > STALL_PERIODS * bench.timing.period_s
+        if outcome is not Outcome.FAIL or not (stalled and was_set_up) or attempt == REPEATS:
             break
         note = f"; repeated, as this host stood still for {1e3 * bench.stall_s:.0f} ms"
     if outcome is Outcome.FAIL and stalled:

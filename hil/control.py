@@ -20,6 +20,7 @@ from drivers.axis import Axis, AxisStatus
 from drivers.errors import BusDownError, BusError
 from drivers.fault_frame import FaultKind, FaultOrder, FaultTarget, pack_fault
 from hil.config import Config, ConfigError
+from hil.ladder import Ladder
 
 AT_REST_RAD_S = 0.05
 """A damped stop ends when every joint is slower than this."""
@@ -75,6 +76,8 @@ class Control:
         tau_sent_Nm: Torques sent in the last cycle.
         feedback_ns: When the last feedback frame of the cycle had been taken.
         law_ns: When law and limits were done.
+        is_fresh: All feedback was there in time in the last cycle.
+        ladder: Cycles in which feedback was late or missing, by what was done about it.
     """
 
     def __init__(
@@ -91,6 +94,8 @@ class Control:
         self.tau_sent_Nm = [0.0] * n
         self.feedback_ns = 0
         self.law_ns = 0
+        self.is_fresh = False
+        self.ladder = Ladder(config.loop.feedback_timeout_s)
         self._bus = bus
         self._now_ns = now_ns
         self._events = events
@@ -135,15 +140,19 @@ class Control:
     def _rest_without_bus(self, error: BusDownError) -> None:
         """The bus is away for a while: latch that, once; the drives' watchdogs remove torque."""
         self.feedback_ns = self.law_ns = self._now_ns()
+        self.is_fresh = False
         self._age += 1
         if self.machine.fault is FaultCode.NONE:
             self._trip(FaultCode.BUS_FAILED, detail=str(error))
         self.tau_sent_Nm = self._rest()
 
     def _exchange(self, deadline_ns: int, periods: int) -> None:
+        began_ns = self._now_ns()
         self._bus.request_feedback()
-        is_fresh = self._bus.collect(deadline_ns)
+        self.is_fresh = is_fresh = self._bus.collect(deadline_ns)
         self.feedback_ns = self._now_ns()
+        if is_fresh and self.feedback_ns - began_ns > self.ladder.late_after_ns:
+            self.ladder.late += 1
         self._take_feedback(is_fresh, periods)
         self._check_amplifiers()
         try:
@@ -265,8 +274,10 @@ class Control:
     def _bridge_gap(self) -> list[float]:
         """Feedback is missing: hold the last torque, then damp, then give up."""
         if self._age <= self._limits.n_hold:
+            self.ladder.held += 1
             return self.tau_sent_Nm
         if self._age <= self._limits.n_hold + self._limits.n_damp:
+            self.ladder.damped += 1
             damped = [
                 0.0 if axis.age_cycles else -d * dq
                 for axis, d, dq in zip(
@@ -274,6 +285,7 @@ class Control:
                 )
             ]
             return self._limiter.step(damped, self._period_s)
+        self.ladder.given_up += 1
         silent = next(axis for axis in self._bus.axes if axis.age_cycles)
         why = silent.note or f"{silent.label}: silent"
         self._trip(FaultCode.FEEDBACK_LOST, detail=f"{why} for {self._age} cycles")

@@ -16,7 +16,8 @@ from hil.telemetry import SampleLayout
 
 SETTLE_CYCLES = 100
 """Cycles recorded after the end of the trajectory."""
-STOP_CYCLES = 5000
+STOP_MARGIN_CYCLES = 100
+"""Cycles beyond those that a damped stop may take until the arm must be idle."""
 
 
 def scenario_request(scenario: Scenario) -> TrajectoryRequest:
@@ -124,6 +125,7 @@ def play_in_simulation(
         simulation.close()
         raise SimulationError(f"the arm went into {machine.state.name} ({machine.fault.name})")
     simulation.execute("disable")
-    simulation.run_until(State.IDLE, STOP_CYCLES)
+    stop_cycles = round(config.controller.stop_time_s / period_s)
+    simulation.run_until(State.IDLE, stop_cycles + STOP_MARGIN_CYCLES)
     simulation.close()
     return simulation.cycle * period_s

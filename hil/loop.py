@@ -21,12 +21,12 @@ from hil.errors import HilError
 from hil.executor import Executor
 from hil.realtime import (
     Granted,
-    Sleeper,
+    Usage,
     die_with_parent,
     freeze_garbage,
     make_realtime,
+    make_sleeper,
     now_ns,
-    usage,
 )
 from hil.sampler import Sampler, Stamps
 from hil.shared import STATUS_EVERY_S, SharedMemory
@@ -71,6 +71,8 @@ class Loop:
         self._executor = Executor(self._control, shared.rows, self._report_outcome)
         self._sampler = Sampler(shared.layout, self._control, bus)
         self._commands = shared.reader("commands", "loop")
+        self._timing = shared.timing
+        self._usage = Usage()
         self._parent = os.getppid()
         self._cycle = 0
         self._overruns = 0
@@ -107,19 +109,20 @@ class Loop:
         self._control.fire(Trigger.BUS_READY)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._end)
-        sleeper = Sleeper()
+        sleep_until = make_sleeper(is_spinning=self._config.loop.spin)
+        self._usage = Usage()
         status_every = round(STATUS_EVERY_S / self._config.loop.period_s)
         look_after_at = 0
         farewell = FAREWELL_CYCLES
         start_ns = now_ns() + self._period_ns
         while farewell:
-            sleeper.until(start_ns)
+            sleep_until(start_ns)
             woke_ns = now_ns()
             skipped = max(0, (woke_ns - start_ns) // self._period_ns)
             start_ns += skipped * self._period_ns  # skipped, never made up by a burst
             self._overruns += skipped
             self._cycle += skipped
-            self._run_cycle(start_ns, woke_ns, 1 if self._is_lockstep else 1 + skipped)
+            self._run_cycle(start_ns, woke_ns, skipped)
             if self._cycle >= look_after_at:
                 look_after_at = self._cycle + status_every
                 self._look_after()
@@ -129,9 +132,11 @@ class Loop:
                 farewell -= 1
                 self._timeout_ns = min(self._timeout_ns, FAREWELL_TIMEOUT_NS)
         self._look_after()
+        self._emit("timing", self._account())
 
-    def _run_cycle(self, start_ns: int, woke_ns: int, periods: int) -> None:
+    def _run_cycle(self, start_ns: int, woke_ns: int, skipped: int) -> None:
         cpu_ns = thread_time_ns()
+        periods = 1 if self._is_lockstep else 1 + skipped
         if self._shared.estop_requests != self._estops_seen:
             self._estops_seen = self._shared.estop_requests
             self._take({"verb": "estop"})
@@ -149,6 +154,7 @@ class Loop:
             sent_ns - start_ns,
             thread_time_ns() - cpu_ns,
         )
+        self._timing.note(stamps, is_fresh=self._control.is_fresh, skipped=skipped)
         ring = self._shared.samples
         offset = ring.begin(self._shared.layout.size)
         self._sampler.write(ring.memory, offset, (self._cycle, start_ns, self._overruns), stamps)
@@ -187,9 +193,14 @@ class Loop:
                 "realtime_missing": list(self._granted.missing),
                 "is_lockstep": self._is_lockstep,
                 "amplifiers": [info.name for info in self._infos],
-                **usage(),
+                **self._account(),
             }
         )
+
+    def _account(self) -> dict[str, Any]:
+        """What the run has cost so far, and what was late in it."""
+        ladder, misses = self._control.ladder.counts(), self._timing.misses()
+        return {**self._usage.since_start(), "ladder": ladder, "misses": misses}
 
     def _watch_supervisor(self) -> None:
         if os.getppid() != self._parent and not self._executor.is_ending:

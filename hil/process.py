@@ -21,7 +21,7 @@ def outlast_loop(shared: SharedMemory, parent_pid: int, work: Callable[[], objec
         parent_pid: The supervisor. While it lives, this returns at once.
         work: Called again and again, for as long as a damped stop may take at most.
     """
-    deadline_s = monotonic() + shared.config.controller.limits.stop_timeout_s + 1.0
+    deadline_s = monotonic() + shared.config.controller.stop_time_s + 1.0
     while os.getppid() != parent_pid and monotonic() < deadline_s:
         if not shared.is_alive("loop", SILENCE_S):
             return

@@ -6,6 +6,7 @@ import gc
 import os
 import resource
 import signal
+from collections.abc import Callable
 from dataclasses import dataclass
 from time import clock_gettime_ns
 
@@ -46,6 +47,17 @@ class Sleeper:
         self._time.tv_sec, self._time.tv_nsec = divmod(t_ns, 1_000_000_000)
         while self._sleep(CLOCK_MONOTONIC, _TIMER_ABSTIME, self._reference, None) == errno.EINTR:
             pass
+
+
+def spin_until(t_ns: int) -> None:
+    """Return at `t_ns` without having given the core away."""
+    while clock_gettime_ns(CLOCK_MONOTONIC) < t_ns:
+        pass
+
+
+def make_sleeper(*, is_spinning: bool) -> Callable[[int], None]:
+    """Return what waits until an instant of CLOCK_MONOTONIC: asleep, or by looking at the clock."""
+    return spin_until if is_spinning else Sleeper().until
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +134,23 @@ def die_with_parent(parent_pid: int) -> None:
         raise SystemExit(1)
 
 
-def usage() -> dict[str, int]:
-    """Page faults and context switches of this process so far."""
+class Usage:
+    """Page faults and context switches of this process since the object was made."""
+
+    def __init__(self) -> None:
+        self._start = _usage()
+
+    def since_start(self) -> dict[str, int]:
+        """Return minor and major faults, voluntary and involuntary switches, and resident pages.
+
+        `resident_kB` is the most that was ever resident: what grows in a run shows there.
+        """
+        now = _usage()
+        counts = {name: count - self._start[name] for name, count in now.items()}
+        return {**counts, "resident_kB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
+
+
+def _usage() -> dict[str, int]:
     used = resource.getrusage(resource.RUSAGE_SELF)
     return {
         "minor_faults": used.ru_minflt,

@@ -19,9 +19,9 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from mcap.writer import Writer
 
 from hil.errors import HilError
+from hil.mcap_writer import McapWriter
 from hil.proto import telemetry_pb2
 
 FLUSH_PERIOD_NS: Final = 100_000_000
@@ -91,7 +91,7 @@ class RecordingWriter:
             self._file = path.open("wb")
         except OSError as error:
             raise RecordingError(f"cannot create recording {path}: {error.strerror}") from error
-        self._writer: Any = Writer(self._file)  # untyped in part
+        self._writer = McapWriter(self._file)
         self._writer.start(library="hil")
         layout = {"json": text, "joints": str(joints), "with_truth": json.dumps(with_truth)}
         if part is not None:
@@ -113,7 +113,7 @@ class RecordingWriter:
         message.DESCRIPTOR.file.CopyToProto(files.file.add())
         name = message.DESCRIPTOR.full_name
         schema = self._writer.register_schema(name, "protobuf", files.SerializeToString())
-        return int(self._writer.register_channel(topic, "protobuf", schema))
+        return self._writer.register_channel(topic, "protobuf", schema)
 
     def add_sample(self, t_ns: int, seq: int, payload: bytes) -> None:
         """Add one serialised `hil.v1.Sample`.
@@ -166,14 +166,14 @@ class RecordingWriter:
             RecordingError: As for `add_sample`.
         """
         try:
-            self._writer.add_attachment(t_ns, t_ns, _ROWS_NAME.format(crc), _ROWS_TYPE, rows)
+            self._writer.add_attachment(t_ns, _ROWS_NAME.format(crc), _ROWS_TYPE, rows)
         except OSError as error:
             raise self._write_error(error) from error
 
     def _add(self, channel: int, t_ns: int, payload: bytes, seq: int) -> None:
         self.is_empty = False
         try:
-            self._writer.add_message(channel, t_ns, payload, t_ns, seq & 0xFFFF_FFFF)
+            self._writer.add_message(channel, t_ns, payload, seq & 0xFFFF_FFFF)
             if t_ns >= self._due_ns:
                 self._due_ns = t_ns + FLUSH_PERIOD_NS
                 self._writer.flush()

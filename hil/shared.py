@@ -1,7 +1,7 @@
 """Shared memory between the loop and the processes around it: lock-free, one writer per part.
 
-One memory file (memfd) holds the configuration, five rings, the trajectory slots and a few
-counters. Nobody ever waits for anybody: a writer that laps a reader is noticed by the reader as
+One memory file (memfd) holds the configuration, six rings, the trajectory slots, the histograms of
+the loop's timing and a few counters. Nobody ever waits for anybody: a writer that laps a reader is noticed by the reader as
 lost records. The file has no name, so that nothing is left behind however the processes end.
 
 Ordering: every record carries its sequence number before and after its payload, written in that
@@ -20,6 +20,7 @@ from typing import Any, Final, Self
 
 from hil.config import Config, config_from_json
 from hil.telemetry import BusFrameLayout, SampleLayout
+from hil.timing import TIMING_BYTES, Timing
 
 _U64 = struct.Struct("<Q")
 _HEAD_WORDS = 2  # sequence number + 1, payload length
@@ -192,6 +193,7 @@ class SharedMemory:
         events: Ring of JSON events, written by the loop.
         commands: Ring of JSON commands, written by the gateway.
         notes: Ring of JSON events about the recording, written by the recorder.
+        timing: Histograms of the loop's stamps and its deadline misses, written by the loop.
         layout: Layout of a sample.
         frame_layout: Layout of a bus frame.
     """
@@ -211,6 +213,11 @@ class SharedMemory:
         self.commands = self._ring("commands")
         self.notes = self._ring("notes")
         self._status = self._ring("status")
+        self.timing = Timing(
+            self._view("timing"),
+            period_s=self.config.loop.period_s,
+            timeout_s=self.config.loop.feedback_timeout_s,
+        )
         self._estop = self._view("estop").cast("Q")
         self._part = self._view("recorder.part").cast("Q")
         self._beats = {who: self._view(f"{who}.beat").cast("Q") for who in _CHILDREN}
@@ -323,6 +330,8 @@ def _plan(
     for word in words:
         plan[word] = (at, 8)
         at += 64  # a cache line each: no writer disturbs another
+    plan["timing"] = (at, TIMING_BYTES)
+    at += (TIMING_BYTES + 63) // 64 * 64
     for name, (payload, slots) in rings.items():
         size = Ring.size(payload, slots)
         plan[name] = (at, size, payload, slots)

@@ -107,6 +107,7 @@ class Streams:
         status["telemetry_lost"] = self._samples.lost
         status["wake_late_us"] = _quantiles_us(self._late_ns)
         status["busy_us"] = _quantiles_us(self._busy_ns)
+        status["timing"] = self._shared.timing.summary()
         self._status.put(json.dumps(status))
 
 

@@ -8,7 +8,13 @@ from drivers.errors import AmplifierError
 from drivers.frame import pack_frame, unpack_frame
 from drivers.odrive import codec
 from drivers.odrive.codec import AxisError, AxisState, Command, Heartbeat
-from drivers.odrive.endpoints import EMULATED_SERIAL, INJECT_FAULT_ID, LAYOUT, Endpoint, EndpointTable
+from drivers.odrive.endpoints import (
+    EMULATED_SERIAL,
+    INJECT_FAULT_ID,
+    LAYOUT,
+    Endpoint,
+    EndpointTable,
+)
 from drivers.odrive.service import OdriveService, choose_table, refuse_unless_idle, shown
 from drivers.odrive.settings import OdriveSettings
 
@@ -55,6 +61,8 @@ class OdriveAxis(Axis):
         self._queue: deque[bytes] = deque()
         self._wants_power = False
         self._is_preparing = False
+        self._is_clean = False
+        self._unsettled_cycles = SETTLED_CYCLES
         self._request_age = -1
         self._forgiven_cycles = 0
         self._age_at_end = NEVER
@@ -200,7 +208,7 @@ class OdriveAxis(Axis):
                 tau_Nm = _clip(tau_Nm, limit_Nm)
             motor_Nm = tau_Nm * self._motor_per_joint
             return self._torque_head + codec.F32.pack(motor_Nm) + b"\0\0\0\0"
-        if self._is_preparing and not self._unverified:
+        if self._is_preparing and self._is_clean and not self._unverified:
             self._is_preparing = False
             self._queue.extend(self._power)
             return self._take_request()
@@ -213,7 +221,10 @@ class OdriveAxis(Axis):
         return frame
 
     def enable(self) -> None:
-        """Ask for power: parameters once more, watchdog read back, 0x0B (1, 1), 0x07 = 8."""
+        """Ask for power: parameters once more, watchdog read back, 0x0B (1, 1), 0x07 = 8.
+
+        The last of them wait for a heartbeat without errors, sent since the watchdog is fed.
+        """
         self._wants_power = True
         self._request_age = -1
         self._is_preparing = True
@@ -253,6 +264,8 @@ class OdriveAxis(Axis):
             self._request_age += 1
         if self._forgiven_cycles:
             self._forgiven_cycles -= 1
+        if self._unsettled_cycles:
+            self._unsettled_cycles -= 1
         self._heartbeat_age += 1
         if self._heartbeat_age > self._heartbeat_limit and self.status is not AxisStatus.LOST:
             self._lose(f"no heartbeat for {self._heartbeat_age} cycles")
@@ -328,6 +341,7 @@ class OdriveAxis(Axis):
         if beat is None:
             return False
         self._heartbeat_age = 0
+        self._is_clean = not (beat.errors or self._unsettled_cycles)
         if beat.errors & AxisError.INITIALIZING:
             self._lose("restarted by itself (INITIALIZING)")
             return False

@@ -63,9 +63,13 @@ def heartbeat(errors=0, state=AxisState.IDLE, result=0, node=1):
 
 
 def lone_axis(**changes):
-    """A master that is in operation, with nobody at the other end."""
+    """A master that is in operation and has heard a heartbeat, with nobody at the other end."""
     settings = OdriveSettings(**(OdriveSettings.defaults(1, 15.0) | changes))
-    return OdriveAxis(settings, joint=1, period_s=1e-3)
+    axis = OdriveAxis(settings, joint=1, period_s=1e-3)
+    for _ in range(2):
+        axis.end_cycle()
+    tell(axis, heartbeat())
+    return axis
 
 
 def tell(axis, frame):
@@ -448,6 +452,31 @@ def test_enable__watchdog_not_kept__no_power_and_a_note(rig):
     rig.cycles(100)
     assert not rig.servos[0].is_energised
     assert "watchdog" in rig.axes[0].note
+
+
+def test_enable__in_the_first_cycle__waits_until_the_expired_watchdog_is_cleared():
+    """The last heartbeat before cyclic operation says nothing about the watchdog since."""
+    rig = rig_of()
+    rig.infos = rig.bus.configure(heartbeat_cycles=0)
+    for node in rig.nodes:
+        node.axis.fail(AxisError.WATCHDOG_TIMER_EXPIRED)
+    for can_id in (1, 2):
+        rig.loopback.deliver(heartbeat(node=can_id))
+    rig.enable()
+    assert all(servo.is_energised for servo in rig.servos)
+
+
+@pytest.mark.parametrize("error", [AxisError.DRV_FAULT, AxisError.WATCHDOG_TIMER_EXPIRED])
+def test_enable__fault_not_reset__no_power(rig, error):
+    rig.enable()
+    rig.nodes[0].axis.fail(error)
+    rig.until(lambda: rig.axes[0].status is AxisStatus.FAULT)
+    tap = Tap(rig)
+    rig.axes[0].enable()
+    rig.cycles(100)
+    assert rig.axes[0].status is AxisStatus.FAULT
+    assert not tap.take(1, Command.AXIS_STATE)
+    assert not tap.take(1, Command.CLEAR_ERRORS)
 
 
 def test_enable__answers_lost__no_power():

@@ -106,19 +106,15 @@ def test_frames_of__frames_and_silence__in_order_until_ended(hub):
 # --- play -----------------------------------------------------------------------------------------
 
 
-def test_play__own_pace__spacing_of_the_log(hub):
+def test_play__own_pace__never_ahead_of_the_log(hub):
     log = [(1000.0 + 0.05 * k, pack_frame(0x100 + k)) for k in range(5)]
-    arrivals = []
     with open_bus(hub.address) as listener, open_bus(hub.address) as bus:
-        start_s = monotonic()
         done = play(bus, log, is_fast=False)
-        for _ in log:
-            assert listener.recv(5.0) is not None
-            arrivals.append(monotonic())
+        heard = [listener.recv(5.0) for _ in log]
+    assert heard == [frame for _, frame in log]
     assert done.frames == 5
-    assert done.duration_s == pytest.approx(monotonic() - start_s, abs=0.1)
     assert done.duration_s >= 0.2
-    assert 0.0 <= done.late_s <= done.duration_s - 0.2 + 1e-3
+    assert 0.0 <= done.late_s <= done.duration_s
 
 
 def test_play__fast__all_frames_in_order_without_waiting(hub):

@@ -8,12 +8,15 @@ import signal
 import tempfile
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 from time import monotonic_ns
 
 import can
 import pytest
 
+import hil.conform
 from drivers.arm_bus import ArmBus
+from drivers.axis import AxisStatus
 from drivers.bus import open_bus
 from drivers.cia402 import codec
 from drivers.cia402.codec import Cia402State
@@ -21,7 +24,7 @@ from drivers.frame import pack_frame, unpack_frame
 from drivers.registry import make_axes
 from hil.cli import main
 from hil.config import load_config
-from hil.conform import Bench, Limits, Outcome, Timing, run_steps
+from hil.conform import Bench, Limits, Outcome, Step, Timing, run_steps
 from hil.conform_steps import STEPS
 from hil.emulation import build_emulator
 from sim_backend.hub import UnixHub
@@ -74,7 +77,10 @@ def emulation(*arguments, **keywords):
             running.close()
 
 
-def run_kit(running, limits=LIMITS, steps=STEPS, **changes):
+TIMING = Timing(stall_timeout_s=STALL_S, heartbeat_cycles=100)
+
+
+def run_kit(running, limits=LIMITS, steps=STEPS, timing=TIMING, **changes):
     """Run steps against the first joint; return {step: result}."""
     settings = running.config.axes[0].model_copy(
         update={"torque_max_Nm": limits.torque_max_Nm, **changes}
@@ -82,7 +88,6 @@ def run_kit(running, limits=LIMITS, steps=STEPS, **changes):
     bus = ArmBus(
         open_bus(running.address), make_axes([settings], period_s=1e-3), now_ns=monotonic_ns
     )
-    timing = Timing(stall_timeout_s=STALL_S, heartbeat_cycles=100)
     seen = []
     try:
         results = run_steps(Bench(bus, limits, timing), steps, seen.append)
@@ -299,7 +304,8 @@ def test_kit__torque_of_a_few_steps__start_up_fails_with_the_least():
     assert "use --torque 0.1 or more" in results["start-up"].detail
 
 
-def test_kit__feedback_ends__torque_off_is_asked_for():
+def test_kit__feedback_ends__torque_off_is_asked_for(monkeypatch):
+    monkeypatch.setattr(hil.conform, "MISSING_LIMIT", 2)  # each one missed costs a timeout
     lost = threading.Event()
 
     def dying(frame):
@@ -311,12 +317,13 @@ def test_kit__feedback_ends__torque_off_is_asked_for():
             bench.cycle(0.1)
         return "never"
 
-    steps = [*only(), STEPS[4].__class__("cut", cut, begins=STEPS[4].begins)]
-    with emulation(change=dying, emulator={"time": "wall"}) as running:
-        results = run_kit(running, steps=steps, rpdo_timeout_ms=500)
-        wait_until(lambda: not running.node.drive.machine.is_powered, what="power off")
+    steps = [*only(), Step("cut", cut, begins=AxisStatus.ENABLED)]
+    timing = replace(TIMING, lockstep_timeout_s=0.3)
+    with emulation(change=dying) as running:
+        results = run_kit(running, steps=steps, timing=timing)
+        assert not running.node.drive.machine.is_powered
     assert failed(results) == ["cut"]
-    assert "no feedback for 50 cycles" in results["cut"].detail
+    assert "no feedback for 2 cycles" in results["cut"].detail
 
 
 def test_kit__joint_that_falls__torque_off_beyond_the_travel_allowed():

@@ -1,5 +1,6 @@
 """The recorder on real shared memory: parts, limits of the disk, and kills at any instant."""
 
+import json
 import os
 import random
 import resource
@@ -14,11 +15,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from hil.config import ConfigError, load_config
+from hil.config import ConfigError, config_from_json, load_config
 from hil.export import export_csv
 from hil.realtime import now_ns
 from hil.recorder import Recorder
 from hil.recording import Part, Recording, RecordingError, RecordingWriter
+from hil.replay import Replayer, ReplayError
 from hil.report import write_report
 from hil.shared import SharedMemory
 from hil.telemetry import RECEIVED, SENT, LoggedFrame
@@ -26,6 +28,8 @@ from tests.hil.lab import wait_until
 
 PERIOD_NS = 1_000_000
 SERIES = "5e41e5"
+STALL_S = 0.4
+"""What a busy host may add to the tenth of a second that a kill of everything costs."""
 EVERY_EVENT = 100
 """An event per so many cycles."""
 
@@ -369,3 +373,52 @@ def test_writer__part__stands_in_the_metadata(tmp_path):
     assert Recording.open(path).part == part
     assert part.first(path) == tmp_path / "run.mcap"
     assert part.path(tmp_path / "run.mcap") == path
+
+
+def test_daemon__recorder_killed_again_and_again_in_parts__whole_run_replays_identically(lab):
+    lab.emulate()
+    arm = lab.run("recording.max_size_MB=0.3")
+    arm.client.command("enable")
+    arm.swing()
+    for _ in range(2):
+        before = arm.daemon.children()["recorder"]
+        time.sleep(random.uniform(0.0, 0.3))
+        os.kill(before, signal.SIGKILL)
+        wait_until(
+            lambda old=before: arm.daemon.children().get("recorder", old) != old, what="a new one"
+        )
+        arm.wait_cycles(500)
+    assert arm.daemon.end() == 0
+    run = Recording.open_run(arm.recording)
+    assert len(run.parts) > 3
+    assert not run.is_truncated
+    assert run.samples["seq"].tolist() == list(range(len(run.samples)))
+    continued = [event for event in arm.events if event["kind"] == "recording"]
+    assert {event["action"] for event in continued} == {"continued"}
+    result = Replayer(run, run_config(run)).run()
+    assert result.difference is None
+    assert result.cycles == len(run.samples)
+    with pytest.raises(ReplayError, match=r"part 2 of a run.*replay .*run1\.mcap, it goes on"):
+        Replayer(Recording.open(run.parts[1]), run_config(run))
+
+
+def run_config(recording):
+    return config_from_json(json.dumps(recording.config))
+
+
+def test_daemon__all_processes_killed__file_readable_up_to_the_last_flush(lab):
+    lab.emulate()
+    arm = lab.run()
+    arm.client.command("enable")
+    arm.swing()
+    children = arm.daemon.children()
+    for pid in (*children.values(), arm.daemon.pid):
+        os.kill(pid, signal.SIGKILL)
+    arm.daemon.process.wait()
+    last_seen_ns = int(arm.now["t_ns"])
+    recording = Recording.open(arm.recording)
+    assert recording.is_truncated
+    assert np.all(np.diff(recording.samples["seq"].astype(int)) == 1)
+    lost_s = (last_seen_ns - int(recording.samples["t_ns"][-1])) / 1e9
+    assert lost_s < 0.1 + STALL_S
+    assert write_report(arm.recording, arm.recording.with_suffix("")).exists()
