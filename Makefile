@@ -6,10 +6,14 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 LAB_KERNEL ?= auto# auto, host or uml: see docs/lab.md
 LAB = $(PYTHON) deploy/lab/lab.py --kernel $(LAB_KERNEL)
+OTHER_PYTHONS := 3.12 3.13 3.14
+FUZZ ?= 1000000
+FUZZ_COUNTS = HIL_TEST_MIT_FUZZ_FRAMES=$(FUZZ) HIL_TEST_ODRIVE_FUZZ_FRAMES=$(FUZZ) \
+  HIL_TEST_MOTEUS_FUZZ_FRAMES=$(FUZZ) HIL_TEST_SLCAN_FUZZ_BYTES=$(FUZZ)
 LAB_TESTS = $(BIN)/python -m pytest -m kernel_can --no-skips tests/drivers tests/lab
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lab lint bench proto clean
+.PHONY: help demo test nightly pythons lab lint bench proto clean
 
 help: ## show the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -30,6 +34,21 @@ test: $(STAMP) lint ## everything CI runs
 	$(BIN)/python -m pytest -m "not kernel_can" || \
 	  $(BIN)/python -m pytest -m "not kernel_can" --last-failed --last-failed-no-failures none
 	@$(LAB) --optional -- $(LAB_TESTS)
+
+# The soak takes HIL_SOAK_S seconds (600), each fuzz test FUZZ frames. Nothing may run beside the soak.
+nightly: $(STAMP) pythons ## soak, whole scenarios twice and on other Pythons, long fuzzing: an hour or two
+	HIL_NIGHTLY=1 $(BIN)/python -m pytest -s tests/nightly
+	HIL_NIGHTLY=1 $(BIN)/python -m pytest --timeout 7200 tests/hil/test_determinism.py tests/hil/test_fault_matrix.py
+	$(FUZZ_COUNTS) $(BIN)/python -m pytest -o timeout=7200 -k "fuzz or random_and_mutated" tests/drivers tests/sim_backend
+
+pythons: ## environments of other Pythons that the host has, for the tests of determinism
+	@for v in $(OTHER_PYTHONS); do \
+	  d=$(VENV)/pythons/$$v; test -x $$d/bin/python && continue; \
+	  p=$$(command -v python$$v || ls -d $$HOME/.pyenv/versions/$$v.*/bin/python 2>/dev/null | tail -1); \
+	  if [ -z "$$p" ]; then echo "no Python $$v on this host"; continue; fi; \
+	  $$p -m venv $$d && $$d/bin/pip install --quiet --disable-pip-version-check -c constraints.txt . || \
+	    { echo "Python $$v: the dependencies cannot be installed" >&2; rm -rf $$d; }; \
+	done
 
 lab: $(STAMP) ## the tests of SocketCAN on a real kernel with CAN
 	@$(LAB) -- $(LAB_TESTS)

@@ -85,7 +85,7 @@ class Arm:
         if self._loop is None:
             self.control.step(start_ns + TIMEOUT_NS, 1)
             return
-        self._loop._run_cycle(start_ns, start_ns, 1)
+        self._loop._run_cycle(start_ns, start_ns, 0)
         self._loop._cycle += 1
 
     def restart(self) -> None:

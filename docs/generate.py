@@ -58,6 +58,7 @@ EVENTS: Final = {
     "input": "what came from outside of the bus, before it is carried out: `command`",
     "command": "what became of a command: `id`, `verb`, `ok`, `reason`",
     "recording": "`action`: `continued` in `file`, `removed` `file`, `stopped` for `reason`",
+    "timing": "at the end of the loop: misses, page faults and context switches, of the whole run",
     "bus_load": "simulation with the wire model: load, waiting times",
 }
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from hil.config import Config
 from hil.errors import HilError
-from hil.experiment import Memory, play_in_simulation
+from hil.experiment import Memory, play_trajectory
 from hil.fixed_protobuf import Records
 from hil.messages import TrajectoryRequest
 from hil.metrics import MetricsError, PerJoint, measure
@@ -47,7 +47,7 @@ class Figures:
         ts20_s: Last time it exceeds 20 mrad.
         rate10_1_s: Decay rate of the manifold variable.
         peak_tau_Nm: Largest torque sent.
-        effort_Nm: Root mean square of the torque sent, over the whole run.
+        effort_Nm: Root mean square of the torque sent, from power-on to the end of the trajectory.
         tv_Nm_s: Total variation of the torque sent, per second of the statistics window.
         Kd_min: Smallest gain in use.
         Kd_max: Largest gain in use.
@@ -74,7 +74,7 @@ def simulate(
     stat_start_s: float | None = None,
     end_s: float = math.inf,
 ) -> Figures:
-    """Play one trajectory in virtual time, in memory, and take its figures.
+    """Play one trajectory in virtual time, in memory, and take its figures; nothing is stopped.
 
     Args:
         config: The configuration.
@@ -88,7 +88,7 @@ def simulate(
         MetricsError: If it is too short for its statistics.
     """
     memory = Memory(config.joints)
-    play_in_simulation(config, request, memory)
+    play_trajectory(config, request, memory)
     return take_figures(memory.samples(), stat_start_s, end_s)
 
 

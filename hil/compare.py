@@ -208,9 +208,7 @@ def run_case(case: Case) -> Row:
     _, rate = SCENARIOS[case.scenario]
     request = KellyRequest(duration_s=DURATION_S, rate=rate, approach="none")
     try:
-        figures = simulate(
-            configure(case), request, stat_start_s=STAT_START_S, end_s=DURATION_S
-        )
+        figures = simulate(configure(case), request, stat_start_s=STAT_START_S, end_s=DURATION_S)
     except FAILURES as error:
         return Row(case, failed=str(error), cpu_s=process_time() - began_s)
     values = {name: getattr(figures, name) for name in FIGURES}

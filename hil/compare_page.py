@@ -41,8 +41,8 @@ All figures are of joint 1 / joint 2. rms and peak error: of the arm's true angl
 12-bit encoder (1.534 mrad) whatever encoder is fitted, over {STAT_START_S:g} to {DURATION_S:g} s.
 settled: the last time the error exceeds 20 mrad. rate: ln 10 over the time until |S| is below a
 tenth of where it started, S from the true motion. peak torque and effort: largest and rms torque
-sent, over the whole run. variation: sum of |change of torque| per second, over the same time as the
-errors. Kd: smallest and largest gain in use.
+sent, up to the end of the trajectory; the stop after it does not count. variation: sum of |change
+of torque| per second, over the same time as the errors. Kd: smallest and largest gain in use.
 """
 
 

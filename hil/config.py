@@ -23,6 +23,7 @@ from drivers.bus import split_address
 from drivers.cia402.settings import Cia402Settings
 from drivers.errors import DriverError
 from drivers.registry import SETTINGS, AnyAxisSettings, find_clash
+from hil.endpoints import reachable
 from hil.errors import HilError
 from sim_backend.errors import SimError
 from sim_backend.presets import plant_preset, servo_preset
@@ -65,6 +66,9 @@ class LoopSettings(_Settings):
     )
     priority: int = Field(80, ge=1, le=98, description="of SCHED_FIFO")
     cpu: int | None = Field(None, ge=0, description="core to run on; none = any")
+    spin: bool = Field(
+        False, description="wait for period and feedback by looking, not asleep; takes a whole core"
+    )
     feedback_timeout_s: float = Field(
         0.6e-3, gt=0, description="after the start of a cycle; later feedback is missing"
     )
@@ -98,6 +102,27 @@ class ZenohSettings(_Settings):
     )
     connect: tuple[str, ...] = Field((), description="endpoints of routers or peers to join")
     multicast_scouting: bool = Field(False, description="look for others on the local network")
+    file: str | None = Field(
+        None,
+        description="Zenoh's own JSON5 file with certificates, passwords and access control, as "
+        "`hil keys init` writes it; mode and endpoints are taken from here, `connect` if given",
+    )
+    allow_open: bool = Field(
+        False, description="let anyone who reaches the daemon over the network command it"
+    )
+
+    @model_validator(mode="after")
+    def _check_open(self) -> Self:
+        """Refuse what is open for certain; what `file` asks for is looked at when it is opened."""
+        found = reachable(self.listen)
+        if self.multicast_scouting:
+            found.append("multicast_scouting")
+        if found and not (self.file or self.allow_open):
+            raise ValueError(
+                f"{found[0]} reaches beyond this host and nobody is asked who they are: set "
+                "zenoh.file (`hil keys init` makes one), or zenoh.allow_open = true"
+            )
+        return self
 
 
 class RecordingSettings(_Settings):

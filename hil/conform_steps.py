@@ -1,22 +1,24 @@
-"""The steps of a conformance run, in the order in which they are asked.
-
-Torque steps are pulses: up, twice as long down, up again. They bring a free joint back to rest near
-where it was, and show the reported torque with either sign.
-"""
-
-from dataclasses import dataclass
+"""The steps of a conformance run, in the order in which they are asked."""
 
 from drivers.axis import Axis, AxisStatus
-from hil.conform import Bench, NotAskedError, Step, StepError
+from hil.conform import Step
+from hil.conform_bench import Bench, NotAskedError, StepError
+from hil.conform_pulse import (
+    DECAY_CYCLES,
+    PLATEAU_CYCLES,
+    RESOLUTION_STEPS,
+    expect_no_torque,
+    expect_torque,
+    expect_torque_gone,
+    plateau,
+    pulse,
+    torque_resolution_Nm,
+)
 
 SETTLED_CYCLES = 50
 """Cycles over which something has to stay as it is."""
 FRESH_SHARE = 0.9
 """Least share of fresh feedback of a drive that runs by its own clock; in lockstep, all."""
-PLATEAU_CYCLES = 12
-"""Length of the shortest pulse's first part, but for the cycles between two reports."""
-JUDGED_CYCLES = 4
-"""Torque is judged over so many cycles before each part ends."""
 LONGEST_PULSE = 16
 """The direction of motion is sought with pulses of up to so many times the shortest."""
 VISIBLE_STEPS = 6
@@ -26,113 +28,12 @@ VISIBLE_RAD = 5e-3
 LEVELS = (0.25, 0.5, 1.0)
 """Shares of `Limits.torque_Nm` that are asked for."""
 OVER_LIMIT = 10.0
-RESOLUTION_STEPS = 3
-"""Reported torque may always be off by so many of its own steps."""
 TORQUE_STEPS = 20
 """Least number of the drive's torque steps that the torque of the run has to be."""
-NOISE_SHARE = 0.1
-"""Torque that counts as none, as a share of `Limits.torque_Nm`."""
-DECAY_CYCLES = 3
-"""Cycles in which the winding's current may die away and the report of it arrive."""
 WATCHDOG_MARGIN = 1.5
 WATCHDOG_SLACK_S = 0.01
 QUICK_WATCHDOG_S = 0.05
 """Only with a watchdog as quick as this is torque applied while commands cease."""
-
-
-@dataclass(frozen=True, slots=True)
-class Pulse:
-    """What a drive did during one pulse."""
-
-    up_Nm: float
-    """Mean reported torque of the first part's end."""
-    down_Nm: float
-    """The same of the second part."""
-    largest_Nm: float
-    """Largest magnitude reported."""
-    high_rad: float
-    """Farthest the joint was above its start while the first two parts balanced."""
-    low_rad: float
-    """Farthest below, as a negative number."""
-
-
-def pulse(bench: Bench, tau_Nm: float, cycles: int) -> Pulse:
-    """Run +tau for `cycles`, -tau for twice as many, +tau again, and none after that.
-
-    Raises:
-        StepError: If the axis does not stay enabled, or a limit was broken.
-    """
-    start_rad = bench.axis.q_rad
-    angles: list[float] = []
-    torques: list[float] = []
-    for part, sign in ((cycles, 1.0), (2 * cycles, -1.0), (cycles, 1.0), (cycles, 0.0)):
-        for _ in range(part):
-            bench.cycle(sign * tau_Nm)
-            bench.expect_status(AxisStatus.ENABLED)
-            torques.append(bench.axis.tau_meas_Nm)
-            angles.append(bench.axis.q_rad - start_rad)
-    return Pulse(
-        up_Nm=_mean_before(torques, cycles),
-        down_Nm=_mean_before(torques, 3 * cycles),
-        largest_Nm=max(abs(tau) for tau in torques),
-        high_rad=max(angles[: 2 * cycles]),
-        low_rad=min(angles[: 2 * cycles]),
-    )
-
-
-def plateau(bench: Bench) -> int:
-    """Return how many cycles a torque has to be held to be reported for certain."""
-    return PLATEAU_CYCLES + 2 * bench.report_cycles
-
-
-def _mean_before(values: list[float], end: int) -> float:
-    part = values[end - JUDGED_CYCLES : end]
-    return sum(part) / len(part)
-
-
-def _thousandths(value: float) -> str:
-    return f"{1e3 * value:.3g}" if value >= 1e-6 else "less than 0.001"
-
-
-def _cycles(count: int) -> str:
-    return f"{count} cycle{'' if count == 1 else 's'}"
-
-
-def _resolution_Nm(bench: Bench) -> float:
-    return bench.info.torque_resolution_Nm if bench.info is not None else 0.0
-
-
-def _noise_Nm(bench: Bench) -> float:
-    return max(RESOLUTION_STEPS * _resolution_Nm(bench), NOISE_SHARE * bench.limits.torque_Nm)
-
-
-def _expect_torque(bench: Bench, what: str, found_Nm: float, wanted_Nm: float) -> None:
-    """Refuse a reported torque that is not the commanded one."""
-    allowed_Nm = max(
-        bench.limits.tolerance * abs(wanted_Nm), RESOLUTION_STEPS * _resolution_Nm(bench)
-    )
-    if found_Nm * wanted_Nm < 0.0 and abs(found_Nm) > allowed_Nm:
-        raise StepError(
-            f"{what}: {wanted_Nm:+.3f} Nm commanded, {found_Nm:+.3f} Nm reported: the sign is "
-            "wrong; check axes.N.direction"
-        )
-    if abs(found_Nm - wanted_Nm) > allowed_Nm:
-        raise StepError(
-            f"{what}: {wanted_Nm:+.3f} Nm commanded, {found_Nm:+.3f} Nm reported, more than "
-            f"{allowed_Nm:.3f} Nm apart"
-        )
-
-
-def _expect_no_torque(bench: Bench) -> None:
-    if abs(bench.axis.tau_meas_Nm) > _noise_Nm(bench):
-        raise StepError(f"{bench.axis.tau_meas_Nm:+.3f} Nm reported although there should be none")
-
-
-def _expect_torque_gone(bench: Bench) -> None:
-    """Refuse torque that is still reported a moment after the drive left operation."""
-    for _ in range(DECAY_CYCLES + bench.report_cycles):
-        bench.listen()
-    _expect_no_torque(bench)
 
 
 # --- start-up -----------------------------------------------------------------------------------
@@ -174,7 +75,7 @@ def feedback(bench: Bench) -> str:
     if fresh < needed * 2 * SETTLED_CYCLES:
         raise StepError(f"only {fresh} of {2 * SETTLED_CYCLES} cycles had fresh feedback")
     bench.expect_status(AxisStatus.DISABLED, AxisStatus.FAULT)
-    _expect_no_torque(bench)
+    expect_no_torque(bench)
     found = f"; begins in fault: {bench.axis.note}" if bench.axis.status is AxisStatus.FAULT else ""
     return f"{fresh} of {2 * SETTLED_CYCLES} cycles fresh, at {bench.axis.q_rad:+.4f} rad{found}"
 
@@ -189,7 +90,7 @@ def enable(bench: Bench) -> str:
     for _ in range(SETTLED_CYCLES):
         bench.cycle()
         bench.expect_status(AxisStatus.ENABLED)
-        _expect_no_torque(bench)
+        expect_no_torque(bench)
     return f"enabled after {_cycles(cycles)}, no torque"
 
 
@@ -199,8 +100,8 @@ def torque(bench: Bench) -> str:
     for level in LEVELS:
         tau_Nm = level * bench.limits.torque_Nm
         seen = pulse(bench, tau_Nm, plateau(bench))
-        _expect_torque(bench, f"{level:g} of --torque", seen.up_Nm, tau_Nm)
-        _expect_torque(bench, f"{level:g} of --torque", seen.down_Nm, -tau_Nm)
+        expect_torque(bench, f"{level:g} of --torque", seen.up_Nm, tau_Nm)
+        expect_torque(bench, f"{level:g} of --torque", seen.down_Nm, -tau_Nm)
         shown.append(f"{tau_Nm:.3f}: {seen.up_Nm:+.3f}/{seen.down_Nm:+.3f}")
     return f"commanded: reported, Nm: {', '.join(shown)}"
 
@@ -239,9 +140,10 @@ def over_limit(bench: Bench) -> str:
     """Far too much torque is cut to the limit, on its way to the drive or in it."""
     limit_Nm = bench.limits.torque_max_Nm
     seen = pulse(bench, OVER_LIMIT * limit_Nm, plateau(bench))
-    _expect_torque(bench, "over the limit", seen.up_Nm, limit_Nm)
-    _expect_torque(bench, "over the limit", seen.down_Nm, -limit_Nm)
-    most_Nm = (1.0 + bench.limits.tolerance) * limit_Nm + RESOLUTION_STEPS * _resolution_Nm(bench)
+    expect_torque(bench, "over the limit", seen.up_Nm, limit_Nm)
+    expect_torque(bench, "over the limit", seen.down_Nm, -limit_Nm)
+    slack_Nm = RESOLUTION_STEPS * torque_resolution_Nm(bench)
+    most_Nm = (1.0 + bench.limits.tolerance) * limit_Nm + slack_Nm
     if seen.largest_Nm > most_Nm:
         raise StepError(f"{seen.largest_Nm:.3f} Nm reported, the limit is {limit_Nm:.3f} Nm")
     return (
@@ -275,7 +177,7 @@ def _feeds_by_asking(axis: Axis) -> bool:
 def _watchdog_time_s(bench: Bench) -> float:
     """Return after how long the loss has to have had its effect, and to have been reported."""
     limits = bench.limits
-    return WATCHDOG_MARGIN * limits.watchdog_s + limits.report_s + WATCHDOG_SLACK_S
+    return WATCHDOG_MARGIN * limits.watchdog_s + limits.state_report_s + WATCHDOG_SLACK_S
 
 
 def loss_of_commands(bench: Bench) -> str:
@@ -289,7 +191,7 @@ def loss_of_commands(bench: Bench) -> str:
         if not bench.listen():
             continue
         if not bench.bus.is_enabled:
-            _expect_torque_gone(bench)
+            expect_torque_gone(bench)
             after_ms = 1e3 * count * bench.timing.period_s
             return f"{tau_Nm:.3f} Nm, removed {after_ms:.0f} ms after its command; {_state(bench)}"
     bench.bring_to(AxisStatus.DISABLED)
@@ -312,7 +214,7 @@ def loss_of_master(bench: Bench) -> str:
         if bench.bus.is_enabled:
             bench.bring_to(AxisStatus.DISABLED)
             raise StepError(f"still enabled after {1e3 * silence_s:.0f} ms without any frame")
-        _expect_torque_gone(bench)
+        expect_torque_gone(bench)
         return f"no torque ({tau_Nm:.3f} Nm before) after {1e3 * silence_s:.0f} ms; {_state(bench)}"
     raise StepError("no feedback after the silence; the drive does not come back by itself")
 
@@ -330,7 +232,7 @@ def stays_off(bench: Bench) -> str:
         bench.cycle(LEVELS[0] * bench.limits.torque_Nm)
         if bench.bus.is_enabled:
             raise StepError("the drive enabled itself when commands came back")
-        _expect_no_torque(bench)
+        expect_no_torque(bench)
     return f"{4 * SETTLED_CYCLES} cycles of torque commands, none applied"
 
 
@@ -344,9 +246,9 @@ def fault(bench: Bench) -> str:
     if not bench.bus.inject_fault(0):
         raise NotAskedError("the family has no command that makes an emulated drive fail")
     cycles = bench.wait_for(AxisStatus.FAULT)
-    for _ in range(DECAY_CYCLES + bench.report_cycles):
+    for _ in range(DECAY_CYCLES + 2 * bench.report_cycles):
         bench.cycle()
-    _expect_no_torque(bench)
+    expect_no_torque(bench)
     return f"after {_cycles(cycles)}; {bench.axis.note}"
 
 
@@ -358,7 +260,7 @@ def fault_holds(bench: Bench) -> str:
     for _ in range(2 * SETTLED_CYCLES):
         bench.cycle(LEVELS[0] * bench.limits.torque_Nm)
         bench.expect_status(AxisStatus.FAULT)
-        _expect_no_torque(bench)
+        expect_no_torque(bench)
     return f"{2 * SETTLED_CYCLES} cycles with a request for power: still in fault, no torque"
 
 
@@ -381,8 +283,8 @@ def enable_again(bench: Bench) -> str:
     cycles = bench.wait_for(AxisStatus.ENABLED)
     tau_Nm = LEVELS[-1] * bench.limits.torque_Nm
     seen = pulse(bench, tau_Nm, plateau(bench))
-    _expect_torque(bench, "after the reset", seen.up_Nm, tau_Nm)
-    _expect_torque(bench, "after the reset", seen.down_Nm, -tau_Nm)
+    expect_torque(bench, "after the reset", seen.up_Nm, tau_Nm)
+    expect_torque(bench, "after the reset", seen.down_Nm, -tau_Nm)
     return f"enabled after {_cycles(cycles)}, {seen.up_Nm:+.3f}/{seen.down_Nm:+.3f} Nm"
 
 
@@ -398,9 +300,9 @@ def disable(bench: Bench) -> str:
             bench.expect_status(AxisStatus.ENABLED)
     bench.axis.disable()
     cycles = bench.wait_for(AxisStatus.DISABLED, tau_Nm)
-    for _ in range(DECAY_CYCLES + bench.report_cycles):
+    for _ in range(DECAY_CYCLES + 2 * bench.report_cycles):
         bench.cycle(tau_Nm)
-    _expect_no_torque(bench)
+    expect_no_torque(bench)
     return f"disabled after {_cycles(cycles)}, no torque"
 
 
@@ -409,8 +311,16 @@ def disabled_torque(bench: Bench) -> str:
     for _ in range(SETTLED_CYCLES):
         bench.cycle(bench.limits.torque_Nm)
         bench.expect_status(AxisStatus.DISABLED)
-        _expect_no_torque(bench)
+        expect_no_torque(bench)
     return f"{SETTLED_CYCLES} cycles of torque commands, none applied"
+
+
+def _thousandths(value: float) -> str:
+    return f"{1e3 * value:.3g}" if value >= 1e-6 else "less than 0.001"
+
+
+def _cycles(count: int) -> str:
+    return f"{count} cycle{'' if count == 1 else 's'}"
 
 
 _OFF, _ON = AxisStatus.DISABLED, AxisStatus.ENABLED

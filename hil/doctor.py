@@ -1,46 +1,39 @@
 """Checks of host, configuration, bus and Zenoh, each with a verdict and a remedy."""
 
 import errno
-import os
+import json
 import platform
-import resource
+import shutil
 import socket
+import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 from drivers.bus import open_bus, split_address
 from drivers.errors import DriverError
 from hil.budget import REMEDY, WARNING_SHARE, bus_budget
 from hil.config import Config
+from hil.finding import Finding, Level
+from hil.host_checks import HOST_CHECKS, read
+from hil.session import SessionError, describe_access, find_open, make_config
 
-Level = Literal["pass", "warn", "fail"]
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One check: what was found and, unless it passed, what to do about it."""
-
-    name: str
-    level: Level
-    found: str
-    remedy: str = ""
+_CONNECT_TIMEOUT_S = 1.0
+_NO_ACCESS = "no authentication"
+"""What `describe_access` says of a daemon that only this host can reach."""
+_PROGRAM_TIMEOUT_S = 5.0
 
 
 def examine(config: Config) -> list[Finding]:
     """Run every check. Nothing is sent to an amplifier."""
     checks: tuple[Callable[[Config], Finding], ...] = (
         _python,
-        _kernel,
-        _scheduler,
-        _memlock,
-        _cores,
-        _governor,
-        _clock,
+        *HOST_CHECKS,
         _bus,
+        _can_interface,
         check_bus_load,
         _zenoh,
+        _routers,
     )
     return [check(config) for check in checks]
 
@@ -52,92 +45,71 @@ def _python(config: Config) -> Finding:
     )
 
 
-def _kernel(config: Config) -> Finding:
-    del config
-    version = platform.version()
-    if "PREEMPT_RT" in version:
-        return Finding("kernel", "pass", f"{platform.release()}, PREEMPT_RT")
-    model = "PREEMPT_DYNAMIC" if "PREEMPT_DYNAMIC" in version else "no full preemption"
-    return Finding(
-        "kernel", "warn", f"{platform.release()}, {model}", "use a PREEMPT_RT kernel for hardware"
-    )
-
-
-def _scheduler(config: Config) -> Finding:
-    wanted = config.loop.priority
-    before, param = os.sched_getscheduler(0), os.sched_getparam(0)
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(wanted))
-        os.sched_setscheduler(0, before, param)
-    except OSError as error:
-        return Finding(
-            "scheduler",
-            _severity(config),
-            f"SCHED_FIFO priority {wanted} not granted ({error.strerror})",
-            f"add '@realtime - rtprio {wanted}' to /etc/security/limits.d, or use "
-            'loop.realtime = "best_effort"',
-        )
-    return Finding("scheduler", "pass", f"SCHED_FIFO priority {wanted} granted")
-
-
-def _memlock(config: Config) -> Finding:
-    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    if soft == resource.RLIM_INFINITY or os.geteuid() == 0:
-        return Finding("memlock", "pass", "unlimited")
-    return Finding(
-        "memlock",
-        _severity(config),
-        f"limit {soft // 1024} KiB",
-        "add '@realtime - memlock unlimited' to /etc/security/limits.d",
-    )
-
-
-def _severity(config: Config) -> Level:
-    return "fail" if config.loop.realtime == "required" else "warn"
-
-
-def _cores(config: Config) -> Finding:
-    usable = os.sched_getaffinity(0)
-    cpu = config.loop.cpu
-    if cpu is not None and cpu not in usable:
-        return Finding("cores", "fail", f"core {cpu} is not among {sorted(usable)}", "set loop.cpu")
-    if len(usable) < 2:
-        return Finding("cores", "warn", "1 core", "give the loop a core of its own")
-    isolated = _read("/sys/devices/system/cpu/isolated")
-    return Finding("cores", "pass", f"{len(usable)} usable, isolated: {isolated or 'none'}")
-
-
-def _governor(config: Config) -> Finding:
-    del config
-    governor = _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
-    if governor in ("", "performance"):
-        return Finding("governor", "pass", governor or "no frequency scaling visible")
-    return Finding("governor", "warn", governor, "cpupower frequency-set -g performance")
-
-
-def _clock(config: Config) -> Finding:
-    del config
-    source = _read("/sys/devices/system/clocksource/clocksource0/current_clocksource")
-    if source in ("tsc", "kvm-clock", "arch_sys_counter", ""):
-        return Finding("clock source", "pass", source or "unknown")
-    return Finding("clock source", "warn", source, "a slow clock costs microseconds per reading")
-
-
 def _bus(config: Config) -> Finding:
     address = config.bus.address
-    scheme, rest = split_address(address)
     try:
         with open_bus(address):
             pass
     except DriverError as error:
         return Finding("bus", "fail", str(error), "see the message")
+    return Finding("bus", "pass", f"{address} can be joined")
+
+
+def _can_interface(config: Config) -> Finding:
+    scheme, interface = split_address(config.bus.address)
     if scheme != "socketcan":
-        return Finding("bus", "pass", f"{address} can be joined")
-    queue = _read(f"/sys/class/net/{rest}/tx_queue_len")
+        return Finding("can interface", "pass", "the bus is none of the kernel's")
+    queue = read(Path(f"/sys/class/net/{interface}/tx_queue_len"))
+    return judge_can(config, interface, queue, _link_details(interface))
+
+
+def judge_can(config: Config, interface: str, queue: str, details: dict[str, Any]) -> Finding:
+    """Judge bit rate and send queue of one of the kernel's CAN interfaces.
+
+    Args:
+        config: The bit rate wanted, and how many joints there are.
+        interface: Its name.
+        queue: Its send queue in frames, as the kernel says it.
+        details: Its entry of `ip -details -json link show`; empty if that is not to be had.
+    """
+    name = "can interface"
+    data = details.get("linkinfo", {}).get("info_data", {})
+    bit_rate, state = data.get("bittiming", {}).get("bitrate"), data.get("state", "")
+    if bit_rate is not None and bit_rate != config.bus.bit_rate:
+        wanted = config.bus.bit_rate
+        remedy = (
+            f"ip link set {interface} down; ip link set {interface} up type can bitrate {wanted}, "
+            "or set bus.bit_rate"
+        )
+        found = f"{interface} runs at {bit_rate} bit/s, bus.bit_rate is {wanted}"
+        return Finding(name, "fail", found, remedy)
+    if state in ("BUS-OFF", "STOPPED"):
+        remedy = f"check wiring and terminators, then ip link set {interface} type can restart"
+        return Finding(name, "fail", f"{interface} is in state {state}", remedy)
+    rate = f"{bit_rate} bit/s" if bit_rate is not None else "no bit rate (virtual, or no `ip`)"
+    found = f"{interface}, {rate}, send queue of {queue or '?'} frames"
     if queue.isdigit() and int(queue) < 4 * config.joints:
-        remedy = f"ip link set {rest} txqueuelen 128"
-        return Finding("bus", "warn", f"{address}, send queue of {queue} frames", remedy)
-    return Finding("bus", "pass", f"{address} can be joined, send queue of {queue} frames")
+        return Finding(name, "warn", found, f"ip link set {interface} txqueuelen 128")
+    if state in ("ERROR-WARNING", "ERROR-PASSIVE"):
+        return Finding(name, "warn", f"{found}, {state}", "check wiring and terminators")
+    return Finding(name, "pass", found)
+
+
+def _link_details(interface: str) -> dict[str, Any]:
+    program = shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin")
+    if program is None:
+        return {}
+    try:
+        done = subprocess.run(  # noqa: S603 - iproute2; the name has been opened as an interface
+            [program, "-details", "-json", "link", "show", "dev", interface],
+            capture_output=True,
+            check=True,
+            timeout=_PROGRAM_TIMEOUT_S,
+        )
+        (details,) = json.loads(done.stdout)
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return {}
+    return details if isinstance(details, dict) else {}
 
 
 def check_bus_load(config: Config) -> Finding:
@@ -152,28 +124,57 @@ def check_bus_load(config: Config) -> Finding:
 
 
 def _zenoh(config: Config) -> Finding:
-    for endpoint in config.zenoh.listen:
-        protocol, _, address = endpoint.partition("/")
-        host, _, port = address.rpartition(":")
-        if protocol != "tcp" or not port.isdigit():
+    """Judge whether the daemon can listen, and who may then command it."""
+    settings = config.zenoh
+    try:
+        found_open, access = find_open(make_config(settings)), describe_access(settings)
+    except SessionError as error:
+        return Finding("zenoh", "fail", str(error), "correct zenoh.file or the endpoints")
+    for endpoint in settings.listen:
+        place = _tcp_place(endpoint)
+        if place is None:
             continue
+        host, port = place
         family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
         with socket.socket(family, socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
-                probe.bind((host.strip("[]"), int(port)))
+                probe.bind((host.strip("[]"), port))
             except OSError as error:
                 level: Level = "warn" if error.errno == errno.EADDRINUSE else "fail"
                 return Finding("zenoh", level, f"{endpoint}: {error.strerror}", "set zenoh.listen")
-        if host not in ("127.0.0.1", "localhost", "[::1]"):
-            return Finding(
-                "zenoh", "warn", f"listens on {endpoint}", "anyone who reaches it can command"
-            )
-    return Finding("zenoh", "pass", ", ".join(config.zenoh.listen) or "listens nowhere")
+    if found_open is not None:
+        level = "warn" if settings.allow_open else "fail"
+        remedy = "anyone who reaches it can command: use a zenoh.file made by `hil keys init`"
+        return Finding("zenoh", level, f"open to the network: {found_open}", remedy)
+    where = ", ".join(settings.listen) or "listens nowhere"
+    return Finding("zenoh", "pass", where if access == _NO_ACCESS else f"{where}; {access}")
 
 
-def _read(path: str) -> str:
-    try:
-        return Path(path).read_text(encoding="ascii").strip()
-    except OSError:
-        return ""
+def _routers(config: Config) -> Finding:
+    """Judge whether the routers and peers to join can be reached."""
+    reached, name = [], "zenoh routers"
+    level: Level = "fail" if config.zenoh.mode == "client" else "warn"
+    for endpoint in config.zenoh.connect:
+        place = _tcp_place(endpoint)
+        if place is None:
+            continue
+        host, port = place
+        try:
+            with socket.create_connection((host.strip("[]"), port), _CONNECT_TIMEOUT_S):
+                reached.append(endpoint)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            return Finding(name, level, f"{endpoint}: {reason}", "start it, or set zenoh.connect")
+    if config.zenoh.mode == "client" and not config.zenoh.connect:
+        found = 'zenoh.mode is "client", zenoh.connect is empty'
+        return Finding(name, "fail", found, "name a router in zenoh.connect")
+    return Finding(name, "pass", f"reached: {', '.join(reached)}" if reached else "none to reach")
+
+
+def _tcp_place(endpoint: str) -> tuple[str, int] | None:
+    """Return host and port of a TCP or TLS endpoint, None of another one."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.split("?")[0].split("#")[0].rpartition(":")
+    is_known = protocol in ("tcp", "tls") and port.isdigit()
+    return (host, int(port)) if is_known else None

@@ -106,6 +106,27 @@ def play_in_simulation(
     progress: Callable[[float], object] | None = None,
 ) -> float:
     """As `run_in_simulation`, into any sink."""
+    simulation = play_trajectory(config, request, sink, progress)
+    period_s = config.loop.period_s
+    simulation.execute("disable")
+    stop_cycles = round(config.controller.stop_time_s / period_s)
+    simulation.run_until(State.IDLE, stop_cycles + STOP_MARGIN_CYCLES)
+    simulation.close()
+    return simulation.cycle * period_s
+
+
+def play_trajectory(
+    config: Config,
+    request: TrajectoryRequest,
+    sink: Sink,
+    progress: Callable[[float], object] | None = None,
+) -> Simulation:
+    """As `play_in_simulation` up to the end of the trajectory; the arm is still under power.
+
+    Raises:
+        Refusal: If the trajectory does not fit the arm.
+        SimulationError: If the arm tripped.
+    """
     simulation = Simulation(config, sink)
     simulation.execute("enable")
     simulation.run_until(State.READY, 1000)
@@ -124,8 +145,4 @@ def play_in_simulation(
     if not machine.state.is_powered:
         simulation.close()
         raise SimulationError(f"the arm went into {machine.state.name} ({machine.fault.name})")
-    simulation.execute("disable")
-    stop_cycles = round(config.controller.stop_time_s / period_s)
-    simulation.run_until(State.IDLE, stop_cycles + STOP_MARGIN_CYCLES)
-    simulation.close()
-    return simulation.cycle * period_s
+    return simulation

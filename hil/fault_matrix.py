@@ -53,11 +53,12 @@ class Bound:
 
 
 SEEN: Final = Bound(20, 20, 0.4)
-"""Told by the first wrong value, or reported by the amplifier (ODrive: with its heartbeat)."""
+"""Told by the first wrong value."""
 GAP: Final = Bound(35, 60, 0.5)
 """Feedback is missing or late: n_hold + n_damp cycles; the amplifiers' watchdogs may act first."""
 TOLERATED: Final = Bound(None, 0, 0.0)
 _BOUNDS: Final = {
+    ("amplifier", "off"): Bound(55, 20, 0.5),  # reported; of an ODrive with its heartbeat, 50 ms
     ("encoder", "stuck"): Bound(560, 90, 0.8),
     ("encoder", "slow"): TOLERATED,
     ("encoder", "delayed"): TOLERATED,

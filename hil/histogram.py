@@ -55,19 +55,25 @@ class Histogram:
     def __init__(self, memory: memoryview | None = None) -> None:
         self._words = (memoryview(bytearray(8 * WORDS)) if memory is None else memory).cast("Q")
 
-    def add(self, value_ns: int) -> None:
-        """Count one duration; negative ones count as 0, those above `LARGEST_NS` as that."""
+    def add(self, value_ns: int, times: int = 1) -> None:
+        """Count a duration; negative ones count as 0, those above `LARGEST_NS` as that."""
         words = self._words
         if value_ns < 64:
-            at = value_ns if value_ns > 0 else 0  # noqa: PLR1730, FURB136 - a call costs more
+            at = value_ns if value_ns > 0 else 0
         else:
-            if value_ns > LARGEST_NS:
+            if value_ns > LARGEST_NS:  # noqa: PLR1730 - a call costs as much as the rest
                 value_ns = LARGEST_NS
             shift = value_ns.bit_length() - _BITS
             at = shift * _PER_OCTAVE + (value_ns >> shift)
-        words[at] += 1
-        if value_ns > words[_MAX]:
+        words[at] += times
+        if value_ns > words[_MAX]:  # noqa: PLR1730 - likewise
             words[_MAX] = value_ns
+
+    def merge(self, other: "Histogram") -> None:
+        """Count everything that another histogram has counted."""
+        mine = np.frombuffer(self._words, dtype=np.int64)
+        mine[:BINS] += other.counts()
+        mine[_MAX] = max(self.max_ns, other.max_ns)
 
     @property
     def max_ns(self) -> int:

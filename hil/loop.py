@@ -30,6 +30,7 @@ from hil.realtime import (
 )
 from hil.sampler import Sampler, Stamps
 from hil.shared import STATUS_EVERY_S, SharedMemory
+from hil.spin import SpinningBus
 from hil.telemetry import LoggedFrame
 
 GATEWAY_TIMEOUT_NS = 2_000_000_000
@@ -259,9 +260,9 @@ def open_arm(
         DriverError: If the bus or an amplifier is not there or not as configured.
     """
     period_s = config.loop.period_s
-    bus = ArmBus(
-        open_bus(config.bus.address), make_axes(config.axes, period_s=period_s), now_ns=now_ns
-    )
+    raw = open_bus(config.bus.address)
+    wire = SpinningBus(raw) if config.loop.spin else raw
+    bus = ArmBus(wire, make_axes(config.axes, period_s=period_s), now_ns=now_ns)
     if start_up is not None:
         bus.log_frames(lambda way, frame: start_up.append(LoggedFrame(now_ns(), way, frame)))
     try:

@@ -242,7 +242,7 @@ def _draw_visited_gains(axes: Any, rows: Records) -> None:  # noqa: ANN401
 
 
 def draw_timing(samples: Records, period_us: float, folder: Path) -> Figure:
-    """Draw histograms of wake-up lateness and busy time, with p50, p99 and maximum.
+    """Draw histograms of wake-up, feedback, commands and busy time, with p50, p99 and maximum.
 
     Args:
         samples: All samples; at least one.
@@ -250,9 +250,15 @@ def draw_timing(samples: Records, period_us: float, folder: Path) -> Figure:
         folder: Where the PNG file goes; it exists.
     """
     path = folder / "timing.png"
-    figures = (("wake_late_ns", "wake-up after the scheduled start"), ("busy_ns", "busy time"))
-    with canvas((9.0, 3.4), path) as figure:
-        for axes, (field, title) in zip(figure.subplots(1, 2), figures, strict=True):
+    figures = (
+        ("wake_late_ns", "wake-up after the scheduled start"),
+        ("feedback_ns", "feedback complete after the scheduled start"),
+        ("sent_ns", "commands sent after the scheduled start"),
+        ("busy_ns", "busy time"),
+    )
+    with canvas((9.0, 6.4), path) as figure:
+        figure.subplots_adjust(hspace=0.55)
+        for axes, (field, title) in zip(figure.subplots(2, 2).flat, figures, strict=True):
             axes.set(xlabel=f"{title} [us]", ylabel="cycles")
             _draw_histogram(axes, np.maximum(samples[field] / 1e3, 1.0), period_us)
     return Figure(path, "Timing of the loop", "Shorter than 1 us counts as 1 us.")

@@ -179,6 +179,14 @@ def part_of(path: Path) -> Part | None:
     return reader.part()
 
 
+def is_part(path: Path, part: Part) -> bool:
+    """Tell whether a file is there, readable, and this part of this run."""
+    try:
+        return part_of(path) == part
+    except RecordingError:  # an older run's, or one whose writer was killed at its first byte
+        return False
+
+
 def _continued(path: Path) -> Iterator[Path]:
     """Return a file and those that continue it, in order."""
     yield path
@@ -186,7 +194,7 @@ def _continued(path: Path) -> Iterator[Path]:
     while part is not None:
         first, part = part.first(path), Part(part.series, part.number + 1)
         path = part.path(first)
-        if not path.exists() or part_of(path) != part:  # of an earlier run of that name
+        if not is_part(path, part):
             return
         yield path
 

@@ -173,6 +173,7 @@ class Replayer:
             )
         if not len(recording.samples) or next(iter(recording.frames()), None) is None:
             raise ReplayError(f"{recording.path} holds no cycles with bus frames to replay")
+        _refuse_black_box(recording)
         self._recording = recording
         self._config = config
         self._trajectories = recording.trajectories()
@@ -256,6 +257,15 @@ class Replayer:
             return None
         replayed = self._layout.decode(self._replayed)
         return first_difference(self._recording.samples[: len(replayed)], replayed)
+
+
+def _refuse_black_box(recording: Recording) -> None:
+    box = next((event for event in recording.events if event.kind == "black_box"), None)
+    if box is not None and recording.samples["seq"][0] > 0:
+        raise ReplayError(
+            f"{recording.path} is a black box that begins in cycle {recording.samples['cycle'][0]}:"
+            f" the controller's state there is in no frame; replay {box.detail['recording']}"
+        )
 
 
 def _inputs_by_cycle(

@@ -27,7 +27,14 @@ from hil.plots import Span, draw_gain_surface, draw_run, draw_timing
 from hil.recording import Part, RecordedEvent, Recording
 from hil.region_report import manifold_section
 from hil.scenarios import SCENARIOS, Scenario
+from hil.timing import CAUSE_TEXTS, TIMES, misses_of, spreads_us
 
+_USAGE: Final = {
+    "minor_faults": "page faults without disk access, whole run",
+    "major_faults": "page faults with disk access, whole run",
+    "involuntary_switches": "involuntary context switches, whole run",
+    "resident_kB": "most memory resident [kB]",
+}
 _STEADY_SHARE: Final = 0.6
 _MOST_EVENTS: Final = 40
 _LIGHT_TORQUE_Nm: Final = 1.0
@@ -137,7 +144,7 @@ def _blocks(recording: Recording, folder: Path) -> Iterator[Block]:
         rows = trajectory_rows(recording.samples)
         yield from manifold_section(rows, metrics.stat_start_s, recording.config, folder)
     yield Heading("Timing")
-    yield from _timing(recording.samples, folder)
+    yield from _timing(recording, folder)
     yield Heading("Events")
     yield from _events(recording)
 
@@ -277,7 +284,8 @@ def _span(samples: Records, metrics: Metrics | None) -> Span:
     return Span(samples, t_s, float(_STEADY_SHARE * t_s[-1]))
 
 
-def _timing(samples: Records, folder: Path) -> Iterator[Block]:
+def _timing(recording: Recording, folder: Path) -> Iterator[Block]:
+    samples = recording.samples
     figures = timing(samples)
     counts = (
         ("cycles", str(figures.cycles)),
@@ -289,16 +297,35 @@ def _timing(samples: Records, folder: Path) -> Iterator[Block]:
         yield Paragraph("The run was in virtual time: lateness and busy time do not exist.")
         return
     spreads = [
-        (name, *(f"{value:.1f}" for value in values))
-        for name, values in (
-            ("wake-up after the scheduled start", figures.wake_late_us),
-            ("busy time", figures.busy_us),
-        )
+        (TIMES[name], *(f"{value:.1f}" for value in values))
+        for name, values in spreads_us(samples).items()
     ]
-    yield Table(("", ""), counts)
-    yield Table(("[us]", "p50", "p99", "max"), spreads)
+    yield Table(("", ""), [*counts, *_misses(recording), *_usage(recording)])
+    yield Table(("[us]", "p50", "p99", "p99.9", "max"), spreads)
     figure = draw_timing(samples, float(np.median(np.diff(samples["t_ns"]))) / 1e3, folder)
     yield Image(figure.path, figure.title, figure.caption)
+
+
+def _misses(recording: Recording) -> Iterator[tuple[str, str]]:
+    """Cycles that missed their deadline, by cause, where the configuration says what that is."""
+    period_s = _setting(recording.config, "loop.period_s")
+    timeout_s = _setting(recording.config, "loop.feedback_timeout_s")
+    if not isinstance(period_s, float) or not isinstance(timeout_s, float):
+        return
+    misses = misses_of(recording.samples, period_s=period_s, timeout_s=timeout_s)
+    for cause, text in CAUSE_TEXTS.items():
+        yield f"deadline missed: {text}", str(misses[cause.name.lower()])
+
+
+def _usage(recording: Recording) -> Iterator[tuple[str, str]]:
+    """What the loop process says of the whole run, if its end is in the recording."""
+    ends = [event.detail for event in recording.events if event.kind == "timing"]
+    for key, text in _USAGE.items():
+        if ends and key in ends[-1]:
+            yield text, str(ends[-1][key])
+    ladder = ends[-1].get("ladder") if ends else None
+    if isinstance(ladder, Mapping):
+        yield "feedback ladder (cycles)", ", ".join(f"{n} {name}" for name, n in ladder.items())
 
 
 def _events(recording: Recording) -> Iterator[Block]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from hil.config import Config
-from hil.recording import Part, RecordingError, part_of
+from hil.recording import Part, is_part
 
 MB: Final = 1e6
 _STAMP: Final = r"-\d{8}-\d{6}(-\d+)?"
@@ -93,13 +93,6 @@ class Retention:
         for number in range(1, running.number + 1):
             part = Part(running.series, number)
             if number not in self._verified:  # it could be an older run's of the same name
-                self._verified[number] = _is(part, part.path(self._first))
+                self._verified[number] = is_part(part.path(self._first), part)
             if self._verified[number]:
                 yield part.path(self._first)
-
-
-def _is(part: Part, path: Path) -> bool:
-    try:
-        return part_of(path) == part
-    except RecordingError:
-        return False

@@ -1,8 +1,9 @@
 """Shared memory between the loop and the processes around it: lock-free, one writer per part.
 
 One memory file (memfd) holds the configuration, six rings, the trajectory slots, the histograms of
-the loop's timing and a few counters. Nobody ever waits for anybody: a writer that laps a reader is noticed by the reader as
-lost records. The file has no name, so that nothing is left behind however the processes end.
+the loop's timing and a few counters. Nobody ever waits for anybody: a writer that laps a reader is
+noticed by the reader as lost records. The file has no name, so that nothing is left behind however
+the processes end.
 
 Ordering: every record carries its sequence number before and after its payload, written in that
 order by single aligned stores (a typed memoryview; `struct.pack_into` would let readers see the

@@ -16,9 +16,12 @@ from uuid import uuid4
 
 from hil.config import Config
 from hil.errors import HilError
+from hil.notify import Watchdog, notify
 from hil.shared import SharedMemory
 
 WATCH_EVERY_S = 0.02
+LOOP_SILENCE_S = 1.0
+"""A loop that has not shown itself for this long no longer feeds the service's watchdog."""
 START_TIMEOUT_S = 30.0
 START_SAMPLES = 20
 """Cycles after which the amplifiers' state is known."""
@@ -117,8 +120,10 @@ class Supervisor:
             if status is not None:
                 return status
             on_ready(self._shared.status())
+            notify("READY=1")
             return self._watch()
         finally:
+            notify("STOPPING=1")
             self._stop_all()
 
     # --- children ----------------------------------------------------------------------------
@@ -167,11 +172,13 @@ class Supervisor:
 
     def _watch(self) -> int:
         """Return the daemon's exit status when it is over."""
-        loop = self._children["loop"]
+        loop, watchdog = self._children["loop"], Watchdog()
         while not self._is_ended:
             if loop.status is not None:
                 self._explain("loop", loop.status)
                 return 1
+            if self._shared.is_alive("loop", LOOP_SILENCE_S):
+                watchdog.beat()
             self._restart_dead()
             sleep(WATCH_EVERY_S)
         return self._stop_loop()

@@ -138,7 +138,7 @@ def misses_of(samples: Records, *, period_s: float, timeout_s: float) -> dict[st
     """
     period_ns, half_ns, law_limit_ns = _limits_ns(period_s, timeout_s)
     late_ns, feedback_ns = samples["wake_late_ns"], samples["feedback_ns"]
-    is_fresh = samples["age_cycles"] == 0
+    is_fresh = samples["feedback_age_cycles"] == 0
     is_overdue = samples["sent_ns"] > period_ns
     skipped = np.diff(samples["overruns"].astype(np.int64), prepend=samples["overruns"][0])
     was_overdue = np.concatenate(([False], is_overdue[:-1]))
@@ -167,7 +167,7 @@ def timing_lines(summary: Mapping[str, Any]) -> list[str]:
         if values:
             shown = "".join(f"{values[quantile]:9.1f}" for quantile in QUANTILE_NAMES)
             lines.append(f"{title:44}{shown}")
-    return [*lines, f"deadline misses: {missed_text(summary.get('misses', {}))}"]
+    return [*lines, f"deadline misses (cycles): {missed_text(summary.get('misses', {}))}"]
 
 
 def missed_text(misses: Mapping[str, int]) -> str:

@@ -10,12 +10,12 @@
 | `delayed` | reads what was `hold_ms` ago | answers a period late | a period late | the same |
 | `intermittent` | `off` at times | hears and says nothing at times | nothing at times | the same |
 
-Garbage on the bus has 29-bit identifiers, which hardly anybody listens to: the checksum of CAN
-lets no frame pass that is merely disturbed. A power stage keeps its last torque while its amplifier
-hangs, until the amplifier's own watchdog acts. A bridge, or a process, that hangs keeps frames back and lets them go in one burst at the
-end. An echo is the same frame a second time, one period later. `bus` acts in both directions,
-`host` on what the host sends. Faults of one target replace each other; those of different targets
-add up.
+Garbage on the bus has 29-bit identifiers, which hardly anybody listens to: the checksum of CAN lets
+no frame pass that is merely disturbed. A power stage keeps its last torque while its amplifier
+hangs, until the amplifier's own watchdog acts. A bridge, or a process, that hangs keeps frames back
+and lets them go in one burst at the end. An echo is the same frame a second time, one period later.
+`bus` acts in both directions, `host` on what the host sends. Faults of one target replace each
+other; those of different targets add up.
 
 Time is emulated time in periods of 1 ms, random values come from a seeded generator: the same run
 has the same faults, to the bit.

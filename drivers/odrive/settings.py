@@ -22,9 +22,9 @@ class OdriveSettings(AxisSettings):
         "poll",
         description="poll: asked for at the start of each cycle; cyclic: sent by the drive's clock",
     )
-    heartbeat_ms: int = Field(20, ge=2, le=1000, description="the drive's; faults come with it")
+    heartbeat_ms: int = Field(50, ge=2, le=1000, description="the drive's; faults come with it")
     torque_report_ms: int = Field(
-        10, ge=0, le=1000, description="the drive's torque estimate, 0 = never"
+        20, ge=0, le=1000, description="the drive's torque estimate, 0 = never"
     )
     watchdog_ms: int = Field(
         20, ge=2, le=1000, description="the drive removes torque after this long without a frame"

@@ -18,6 +18,7 @@ VERBS: Final = {
     "emulate": "the emulated arm and amplifiers on a bus",
     "sim": "everything in one process, in virtual time",
     "compare": "laws side by side, in virtual time",
+    "sweep": "a grid of settings, every combination simulated on all cores",
     "send": "command a running daemon",
     "watch": "follow a running daemon",
     "report": "plots and figures from a recording",
@@ -25,8 +26,10 @@ VERBS: Final = {
     "diff": "are two recordings the same run, and if not, where do they part",
     "replay": "a recording once more through drivers and controller, compared frame by frame",
     "doctor": "check host, bus and configuration",
+    "latency": "how late this host wakes the loop, beside cyclictest",
     "faults": "every fault on every target of every amplifier family, in virtual time",
     "conform": "drive one amplifier through its paces, pass or fail per step",
+    "keys": "certificates and access control for those who connect over the network",
     "bus": "monitor, log and play frames; DBC and EDS",
 }
 INTERRUPTED: Final = 130

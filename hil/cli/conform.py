@@ -20,16 +20,8 @@ from drivers.settings import AxisSettings
 from hil.bus_tools import is_virtual
 from hil.cli.options import add_configuration, configuration
 from hil.config import Config
-from hil.conform import (
-    Bench,
-    ConformError,
-    Limits,
-    LoggedFrame,
-    Outcome,
-    StepResult,
-    Timing,
-    run_steps,
-)
+from hil.conform import Outcome, StepResult, run_steps
+from hil.conform_bench import Bench, ConformError, Limits, LoggedFrame, Timing
 from hil.conform_steps import STEPS
 
 TORQUE_SHARE = 0.05
@@ -39,8 +31,9 @@ LIMIT_FACTOR = 2.0
 WATCHDOG_S = 0.1
 AnyAxis = TypeVar("AnyAxis", bound=AxisSettings)
 _WATCHDOG_SETTINGS = ("rpdo_timeout_ms", "watchdog_ms")
-_REPORT_SETTINGS = ("torque_report_ms", "heartbeat_ms")
-"""Families that do not answer SYNC may report torque and state this rarely."""
+_STATE_REPORTS = ("heartbeat_ms",)
+_TORQUE_REPORTS = ("torque_report_ms",)
+"""Families that do not answer SYNC may report state and torque this rarely."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 FRAMES_SHOWN = 40
 FRAMES_SHOWN_OF_FAILURE = 8
@@ -192,7 +185,8 @@ def _limits(options: argparse.Namespace, settings: AxisSettings, config: Config)
         travel_rad=options.travel_rad,
         tolerance=options.tolerance,
         watchdog_s=options.watchdog_s or _longest_s(settings, _WATCHDOG_SETTINGS) or WATCHDOG_S,
-        report_s=0.0 if options.family == "cia402" else _longest_s(settings, _REPORT_SETTINGS),
+        state_report_s=0.0 if options.family == "cia402" else _longest_s(settings, _STATE_REPORTS),
+        torque_report_s=_longest_s(settings, _TORQUE_REPORTS),
         enable_s=config.loop.enable_timeout_s,
         is_clamped=options.clamped,
         may_inject=options.inject or is_virtual(config.bus.address),

@@ -8,7 +8,8 @@ from dataclasses import asdict
 from hil.budget import budget_table, bus_budget
 from hil.cli.options import add_configuration, configuration
 from hil.config import Config
-from hil.doctor import Finding, check_bus_load, examine
+from hil.doctor import check_bus_load, examine
+from hil.finding import Finding
 
 _BUDGET = ""
 """Value of `--bus` without an address."""
@@ -47,5 +48,5 @@ def _show(findings: Sequence[Finding], *, is_json: bool) -> int:
     else:
         for finding in findings:
             remedy = f"  -> {finding.remedy}" if finding.remedy else ""
-            print(f"{finding.level.upper():4}  {finding.name:12}  {finding.found}{remedy}")
+            print(f"{finding.level.upper():4}  {finding.name:14}  {finding.found}{remedy}")
     return 1 if any(finding.level == "fail" for finding in findings) else 0

@@ -10,6 +10,7 @@ from typing import Any
 from hil.cli.options import add_connection, endpoints
 from hil.client import Client
 from hil.fixed_protobuf import Records
+from hil.timing import missed_text, timing_lines
 
 
 class Counter:
@@ -38,6 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--count", action="store_true", help="only count telemetry; JSON at the end"
     )
+    parser.add_argument(
+        "--timing", action="store_true", help="with every status: the loop's times, misses, usage"
+    )
     parser.add_argument("--for", type=float, dest="duration_s", metavar="S", help="end after this")
 
 
@@ -52,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
         if options.count:
             print("counting", flush=True)
         else:
-            client.on_status(_print_status)
+            client.on_status(_print_timing if options.timing else _print_status)
             client.on_event(_print_event)
         deadline_s = monotonic() + (inf if options.duration_s is None else options.duration_s)
         while not signals and monotonic() < deadline_s:
@@ -70,9 +74,21 @@ def _print_status(status: dict[str, Any]) -> None:
         f"{status.get('state', '?'):8} cycle {status.get('cycle', 0):>9}  "
         f"skipped {status.get('overruns', 0)}  "
         f"late p99 {late.get('p99', 0):.0f} us max {late.get('max', 0):.0f} us  "
-        f"busy p99 {busy.get('p99', 0):.0f} us  {status.get('scheduler', '')}",
+        f"busy p99 {busy.get('p99', 0):.0f} us  "
+        f"missed: {missed_text(status.get('misses', {}))}  {status.get('scheduler', '')}",
         flush=True,
     )
+
+
+def _print_timing(status: dict[str, Any]) -> None:
+    _print_status(status)
+    for line in timing_lines(status.get("timing", {})):
+        print(f"    {line}")
+    ladder = ", ".join(f"{count} {name}" for name, count in status.get("ladder", {}).items())
+    names = ("minor_faults", "major_faults", "involuntary_switches", "resident_kB")
+    used = ", ".join(f"{name} {status.get(name, 0)}" for name in names)
+    print(f"    feedback ladder (cycles): {ladder}")
+    print(f"    loop process: {used}", flush=True)
 
 
 def _print_event(event: dict[str, Any]) -> None:

@@ -16,6 +16,9 @@ from sim_backend.servo import Servo
 PROTOCOL = 2
 REBOOT, SAVE, ERASE = 0, 1, 2
 _AMBIENT = 25.0
+_PHASES_MS = {Endpoint.HEARTBEAT_RATE: 0, Endpoint.TORQUES_RATE: 5, Endpoint.ENCODER_RATE: 0}
+_NODE_PHASE_MS = 13
+"""Drives are not switched on in the same millisecond: their cyclic messages are spread."""
 _BROADCASTS = frozenset((Command.ESTOP, Command.ADDRESS, Command.REBOOT, Command.CLEAR_ERRORS))
 
 
@@ -77,7 +80,7 @@ class OdriveNode(AmplifierNode):
         )
         self._version = Version(PROTOCOL, table.hardware, table.firmware, is_unreleased=False)
         self._is_on = False
-        self._ages_ms = dict.fromkeys(self.parameters.rates_ms, 0)
+        self._clock_ms = 0
         self._readers = self._make_readers()
         self._writers = self._make_writers()
 
@@ -88,7 +91,7 @@ class OdriveNode(AmplifierNode):
         self._is_on = True
         self.axis.power_on()
         self.parameters.restore()
-        self._ages_ms = dict.fromkeys(self._ages_ms, 0)
+        self._clock_ms = 0
         self._tell(Command.ADDRESS)
         self._send_heartbeat()
 
@@ -112,6 +115,7 @@ class OdriveNode(AmplifierNode):
         if not self._is_on:
             return
         self.axis.tick(dt_s)
+        self._clock_ms += 1
         if self._is_due(Endpoint.HEARTBEAT_RATE):
             self._send_heartbeat()
         if self._is_due(Endpoint.TORQUES_RATE):
@@ -256,14 +260,12 @@ class OdriveNode(AmplifierNode):
     # --- out --------------------------------------------------------------------------------------
 
     def _is_due(self, endpoint: Endpoint) -> bool:
-        """Count a millisecond; True if the cyclic message is due now."""
+        """Tell whether a cyclic message is due in this millisecond."""
         rate_ms = self.parameters.rates_ms[endpoint]
         if not rate_ms or self.node_id == BROADCAST_NODE:
             return False
-        age_ms = self._ages_ms[endpoint] + 1
-        is_due = age_ms >= rate_ms
-        self._ages_ms[endpoint] = 0 if is_due else age_ms
-        return is_due
+        phase_ms = _PHASES_MS[endpoint] + _NODE_PHASE_MS * self.node_id
+        return (self._clock_ms + phase_ms) % rate_ms == 0
 
     def _send_heartbeat(self) -> None:
         self._send(Command.HEARTBEAT, codec.pack_heartbeat(self.axis.heartbeat()))

@@ -45,6 +45,11 @@ def _mini_cheetah(variant, **more):
     return Case("mit", "watchdog_ms", changes, tells_enabled=False, drops_power=False, **more)
 
 
+def _odrive(**changes):
+    changes |= {"heartbeat_ms": 20, "torque_report_ms": 10}  # what it tells comes with these
+    return Case("odrive", "watchdog_ms", changes, fault_cycles=21)
+
+
 CASES = {
     "cia402": Case("cia402", "rpdo_timeout_ms"),
     "mit damiao": Case("mit", "watchdog_ms"),
@@ -54,9 +59,9 @@ CASES = {
     "mit robstride": Case("mit", "watchdog_ms", {"variant": "robstride"}),
     "moteus": Case("moteus", "watchdog_ms"),
     "moteus prefix": Case("moteus", "watchdog_ms", {"can_prefix": 5}),
-    "odrive poll": Case("odrive", "watchdog_ms", fault_cycles=21),
-    "odrive cyclic": Case("odrive", "watchdog_ms", {"feedback": "cyclic"}, fault_cycles=21),
-    "odrive geared": Case("odrive", "watchdog_ms", {"gear_ratio": 9.0}, fault_cycles=21),
+    "odrive poll": _odrive(),
+    "odrive cyclic": _odrive(feedback="cyclic"),
+    "odrive geared": _odrive(gear_ratio=9.0),
 }
 
 

@@ -15,6 +15,7 @@ from typing import get_args
 import pytest
 
 from controller.settings import LawSettings, VelocitySettings
+from hil.batch import simulate
 from hil.compare import (
     ALL_LAWS,
     CLIPPED,
@@ -37,6 +38,7 @@ from hil.compare_page import PERTURBATION_NOTES, cover_page
 from hil.compare_plots import draw_comparison
 from hil.compare_progress import FILE_NAME, Progress
 from hil.compare_tables import to_csv, to_markdown
+from hil.messages import KellyRequest
 from tests.hil.lab import wait_until
 
 NOMINAL = ("bench_h kelly_4", "nominal")
@@ -174,6 +176,15 @@ def test_command__law_that_trips__told_and_only_a_failure_if_it_was_the_only_one
     assert done.returncode == 1
     assert done.stderr == "hil: 1 of 1 runs tripped; the tables say why\n"
     assert "ESTIMATOR_LOST" in done.stdout
+
+
+def test_simulate__arm_that_trips_in_the_stop_after_it__figures_all_the_same():
+    """The payload, of which the stop knows nothing, is let down too fast after the trajectory."""
+    config = configure(Case("pid Kd=1", "pelican_v kelly_4", "payload +50 %"))
+    request = KellyRequest(duration_s=8.0, rate=0.25, approach="none")
+    figures = simulate(config, request)
+    assert figures.rms_counts[0] > 100.0
+    assert figures.peak_tau_Nm[0] > 5.0
 
 
 def interrupt(directory, some):

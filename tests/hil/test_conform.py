@@ -9,12 +9,13 @@ import tempfile
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import count
 from time import monotonic_ns
 
 import can
 import pytest
 
-import hil.conform
+import hil.conform_bench
 from drivers.arm_bus import ArmBus
 from drivers.axis import AxisStatus
 from drivers.bus import open_bus
@@ -24,14 +25,15 @@ from drivers.frame import pack_frame, unpack_frame
 from drivers.registry import make_axes
 from hil.cli import main
 from hil.config import load_config
-from hil.conform import Bench, Limits, Outcome, Step, Timing, run_steps
+from hil.conform import Outcome, Step, run_steps
+from hil.conform_bench import Bench, Limits, Timing
 from hil.conform_steps import STEPS
 from hil.emulation import build_emulator
 from sim_backend.hub import UnixHub
 from sim_backend.server import EmulatorServer
 from tests.hil.lab import wait_until
 
-STALL_S = 0.1
+STALL_S = 0.5
 TPDO = codec.COB_TPDO1 + 1
 NAMES = [step.name for step in STEPS]
 LIMITS = Limits(torque_Nm=0.75, torque_max_Nm=1.5, watchdog_s=0.02, may_inject=True)
@@ -305,7 +307,7 @@ def test_kit__torque_of_a_few_steps__start_up_fails_with_the_least():
 
 
 def test_kit__feedback_ends__torque_off_is_asked_for(monkeypatch):
-    monkeypatch.setattr(hil.conform, "MISSING_LIMIT", 2)  # each one missed costs a timeout
+    monkeypatch.setattr(hil.conform_bench, "MISSING_LIMIT", 2)  # each one missed costs a timeout
     lost = threading.Event()
 
     def dying(frame):
@@ -335,6 +337,15 @@ def test_kit__joint_that_falls__torque_off_beyond_the_travel_allowed():
         assert not running.node.drive.machine.is_powered
     assert failed(results) == ["enable"]
     assert "more than the 0.02 rad allowed: torque off" in results["enable"].detail
+
+
+def test_kit__joint_that_spins__is_not_enabled():
+    angles = count(step=10)
+    with emulation(change=changing_tpdo(lambda s, p, t: (s, next(angles) % 4096, t))) as running:
+        results = run_kit(running, replace(LIMITS, travel_rad=10.0), steps=only("torque"))
+        assert running.node.drive.machine.state is Cia402State.SWITCH_ON_DISABLED
+    assert failed(results) == ["enable"]
+    assert "does not come to rest within 3 s without torque" in results["enable"].detail
 
 
 # --- the command ----------------------------------------------------------------------------------

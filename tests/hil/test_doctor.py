@@ -2,17 +2,23 @@
 
 import json
 import os
+import shutil
 import socket
+import subprocess
+import sys
 
 import pytest
 
-from hil.doctor import Finding, examine
+from hil import host_checks
+from hil.doctor import examine, judge_can
+from hil.finding import Finding
 from tests.hil.lab import free_port
 from tests.hil.virtual import configured
 
 NAMES = {
-    "python", "kernel", "scheduler", "memlock", "cores", "governor", "clock source", "bus",
-    "bus load", "zenoh",
+    "python", "kernel", "scheduler", "rt throttling", "memlock", "cores", "isolated cores",
+    "irq affinity", "governor", "clock source", "bus", "can interface", "bus load", "zenoh",
+    "zenoh routers",
 }  # fmt: skip
 
 
@@ -81,7 +87,7 @@ def test_doctor__core_not_there__fails():
 
 def test_doctor__zenoh_open_to_the_network__warns():
     port = free_port()
-    found = findings(f'zenoh.listen=["tcp/0.0.0.0:{port}"]')["zenoh"]
+    found = findings(f'zenoh={{listen=["tcp/0.0.0.0:{port}"], allow_open=true}}')["zenoh"]
     assert found.level == "warn"
     assert "command" in found.remedy
     with socket.socket() as taken:
@@ -89,3 +95,134 @@ def test_doctor__zenoh_open_to_the_network__warns():
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
         assert findings(f'zenoh.listen=["{endpoint}"]')["zenoh"].level == "warn"
+
+
+# --- hosts as they should not be --------------------------------------------------------------
+
+
+def host(tmp_path, **files):
+    """A directory that stands for `/`, with these files in it."""
+    for path, text in files.items():
+        place = tmp_path / path.replace("__", "/")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text(text + "\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("text", "cores"), [("", set()), ("1", {1}), ("0,2-4", {0, 2, 3, 4}), ("none", set())]
+)
+def test_cpus__list_of_the_kernel__read(text, cores):
+    assert host_checks.parse_cpus(text) == cores
+
+
+@pytest.mark.parametrize(
+    ("isolated", "setting", "level"),
+    [
+        ("1", "loop.cpu=1", "pass"),
+        ("", "loop.cpu=1", "warn"),
+        ("1-3", "", "warn"),
+        ("", "", "pass"),
+    ],
+)
+def test_isolation__loop_core__among_the_isolated_ones_or_warned(
+    tmp_path, isolated, setting, level
+):
+    root = host(tmp_path, sys__devices__system__cpu__isolated=isolated)
+    found = host_checks.isolation(configured(*[setting] * bool(setting)), root)
+    assert found.level == level
+    assert bool(found.remedy) == (level != "pass")
+
+
+def test_interrupts__on_the_core_of_the_loop__named(tmp_path):
+    root = host(
+        tmp_path,
+        proc__irq__7__effective_affinity_list="1",
+        proc__irq__8__effective_affinity_list="0",
+        proc__irq__9__effective_affinity_list="0-3",
+    )
+    for number in (7, 8):
+        (root / f"proc/irq/{number}/eth0").mkdir()
+    found = host_checks.interrupts(configured("loop.cpu=1"), root)
+    assert (found.level, found.found) == ("warn", "1 on core 1: 7")  # nobody uses 9
+    assert host_checks.interrupts(configured("loop.cpu=2"), root).level == "pass"
+    assert host_checks.interrupts(configured(), root).level == "pass"
+
+
+@pytest.mark.parametrize(
+    ("runtime_us", "spin", "level"),
+    [("950000", "true", "warn"), ("950000", "false", "pass"), ("-1", "true", "pass")],
+)
+def test_throttling__spinning_loop__needs_all_of_the_time(tmp_path, runtime_us, spin, level):
+    root = host(tmp_path, proc__sys__kernel__sched_rt_runtime_us=runtime_us)
+    assert host_checks.throttling(configured(f"loop.spin={spin}"), root).level == level
+
+
+def test_kernel__preempt_rt__passes(tmp_path):
+    assert (
+        host_checks.kernel(configured(), host(tmp_path, sys__kernel__realtime="1")).level == "pass"
+    )
+
+
+@pytest.mark.parametrize(("governor", "level"), [("performance", "pass"), ("powersave", "warn")])
+def test_governor__of_any_core__judged(tmp_path, governor, level):
+    root = host(tmp_path, sys__devices__system__cpu__cpu0__cpufreq__scaling_governor=governor)
+    assert host_checks.governor(configured(), root).level == level
+
+
+@pytest.mark.parametrize(("source", "level"), [("tsc", "pass"), ("hpet", "warn")])
+def test_clock__slow_source__warned_with_a_better_one(tmp_path, source, level):
+    folder = "sys__devices__system__clocksource__clocksource0__"
+    files = {f"{folder}current_clocksource": source, f"{folder}available_clocksource": "tsc hpet"}
+    found = host_checks.clock(configured(), host(tmp_path, **files))
+    assert found.level == level
+    assert ("clocksource=tsc" in found.remedy) == (level == "warn")
+
+
+@pytest.mark.parametrize(("realtime", "level"), [("required", "fail"), ("best_effort", "warn")])
+def test_realtime__asked_for_and_not_granted__a_failure(realtime, level):
+    code = (
+        "import sys; from hil.doctor import examine; from tests.hil.virtual import configured;"
+        "c = configured(f'loop.realtime={sys.argv[1]}');"
+        "print({f.name: f.level for f in examine(c)}['scheduler'])"
+    )
+    without = ["setpriv", "--bounding-set=-sys_nice", "--inh-caps=-sys_nice"]
+    if shutil.which("setpriv") is None or os.geteuid() != 0:
+        pytest.skip("needs setpriv (util-linux) and root, to run without the right")
+    done = subprocess.run(
+        [*without, sys.executable, "-c", code, realtime],
+        capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert done.stdout.strip() == level, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("queue", "bit_rate", "state", "level", "told"),
+    [
+        ("128", 1_000_000, "ERROR-ACTIVE", "pass", "1000000 bit/s"),
+        ("128", 500_000, "ERROR-ACTIVE", "fail", "runs at 500000 bit/s"),
+        ("4", 1_000_000, "ERROR-ACTIVE", "warn", "send queue of 4"),
+        ("128", 1_000_000, "BUS-OFF", "fail", "BUS-OFF"),
+        ("128", 1_000_000, "ERROR-PASSIVE", "warn", "ERROR-PASSIVE"),
+        ("128", None, "", "pass", "no bit rate"),
+    ],
+)
+def test_can__interface__judged_by_bit_rate_queue_and_state(queue, bit_rate, state, level, told):
+    timing = {} if bit_rate is None else {"bittiming": {"bitrate": bit_rate}}
+    details = {"linkinfo": {"info_data": {**timing, "state": state}}}
+    found = judge_can(configured(), "can0", queue, details)
+    assert found.level == level
+    assert told in found.found
+    assert bool(found.remedy) == (level != "pass")
+
+
+def test_routers__nobody_there__fails_for_a_client_and_warns_for_a_peer():
+    connect = f'zenoh.connect=["tcp/127.0.0.1:{free_port()}"]'
+    assert findings(connect)["zenoh routers"].level == "warn"
+    assert findings(connect, "zenoh.mode=client")["zenoh routers"].level == "fail"
+    assert findings("zenoh.mode=client")["zenoh routers"].level == "fail"
+    with socket.socket() as router:
+        router.bind(("127.0.0.1", 0))
+        router.listen()
+        connect = f'zenoh.connect=["tcp/127.0.0.1:{router.getsockname()[1]}"]'
+        assert findings(connect)["zenoh routers"].level == "pass"

@@ -37,7 +37,7 @@ def chosen():
         yield pytest.param(cell, marks=marks, id=f"{cell.target}-{cell.kind}-{cell.family}")
 
 
-@pytest.mark.parametrize("cell", chosen())
+@pytest.mark.parametrize("cell", list(chosen()))
 def test_fault__any_target_kind_family__within_bounds_and_back(cell):
     outcome = run_cell(cell)
     tau_max_Nm = max(matrix_config(cell.family).controller.limits.tau_max_Nm)

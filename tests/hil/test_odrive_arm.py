@@ -11,6 +11,7 @@ from controller.machine import State
 from drivers.odrive import codec
 from drivers.odrive.codec import AxisState, Command
 from hil.config import ConfigError
+from hil.simulation import Simulation
 from tests.hil.lab import HilProcess, one_line, wait_until, whole
 from tests.hil.virtual import Rig, configured
 
@@ -102,6 +103,18 @@ def test_virtual__same_run_twice__the_same_torques():
         return rig.column("sent").tobytes(), rig.column("q").tobytes()
 
     assert torques() == torques()
+
+
+@pytest.mark.parametrize("feedback", ["poll", "cyclic"])
+def test_wired__two_axes_at_1_Mbit_s__feedback_in_time_in_every_cycle(feedback):
+    chosen = [f"axes.{joint}.feedback={feedback}" for joint in (1, 2)]
+    simulation = Simulation(configured(*BOTH, *chosen, "emulator.wire.is_on=true"))
+    simulation.execute("enable")  # in the first cycle: the watchdog has expired by then
+    simulation.run_until(State.READY, 300)
+    for _ in range(500):
+        simulation.step()
+        assert simulation.control._age == 0
+    assert simulation.control.machine.state is State.READY
 
 
 def test_virtual__fault_of_the_odrive_axis__arm_off_reset_and_on_again():

@@ -15,18 +15,21 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from hil.cli import main
 from hil.config import ConfigError, config_from_json, load_config
 from hil.export import export_csv
 from hil.realtime import now_ns
 from hil.recorder import Recorder
 from hil.recording import Part, Recording, RecordingError, RecordingWriter
 from hil.replay import Replayer, ReplayError
-from hil.report import write_report
 from hil.shared import SharedMemory
 from hil.telemetry import RECEIVED, SENT, LoggedFrame
 from tests.hil.lab import wait_until
 
 PERIOD_NS = 1_000_000
+IS_NIGHTLY = os.environ.get("HIL_NIGHTLY") == "1"
+KILLS = 40 if IS_NIGHTLY else 3
+KILLS_OF_ALL = 12 if IS_NIGHTLY else 1
 SERIES = "5e41e5"
 STALL_S = 0.4
 """What a busy host may add to the tenth of a second that a kill of everything costs."""
@@ -119,7 +122,11 @@ class Process:
             **options,
         )  # fmt: skip
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        wait_until(lambda: source.shared.last_beat("recorder"), what="the recorder")
+        wait_until(lambda: self.is_up(source), 60.0, what="the recorder")
+
+    def is_up(self, source):
+        assert self.process.poll() is None, self.process.communicate()
+        return source.shared.last_beat("recorder")
 
     def kill(self):
         self.process.kill()
@@ -133,13 +140,19 @@ class Process:
 
 @pytest.fixture
 def running():
-    """A source that writes a cycle per millisecond until the test is over."""
-    source, is_over = Source(), threading.Event()
+    """A source that writes a cycle per millisecond until the test is over.
+
+    It waits for recorders that are slow to start: nothing is to be lost by that.
+    """
+    source, is_over = Source(max_size_MB=0.1), threading.Event()
 
     def work():
         while not is_over.is_set():
-            due = (now_ns() - source.start_ns) // PERIOD_NS
-            source.run(max(0, min(due - source.cycles, 500)))
+            if (
+                source.shared.reader("samples", "recorder").backlog
+                < source.shared.samples.slots // 2
+            ):
+                source.cycle()
             time.sleep(0.001)
 
     thread = threading.Thread(target=work)
@@ -160,29 +173,26 @@ def committed(source):
     return source.shared.reader("samples", "recorder").place
 
 
-@pytest.mark.parametrize("kills", [4])
 def test_recorder__killed_at_random_instants__flushed_data_is_there_and_nothing_is_missed(
-    running, tmp_path, kills
+    running, tmp_path
 ):
     seed = time.time_ns()
     print(f"seed {seed}")  # noqa: T201 - to repeat a failure
     chance, path = random.Random(seed), tmp_path / "run.mcap"
-    for number in range(1, kills + 1):
+    for _ in range(KILLS):
         process = Process(running, path)
         time.sleep(chance.uniform(0.0, 0.3))
         process.kill()
-        part = Part(SERIES, number).path(path)
-        if part.exists() and committed(running):
-            samples = Recording.open(part).samples  # readable, whatever it was doing
-            if len(samples):
-                assert samples["seq"][-1] + 1 >= committed(running)
-                assert np.all(np.diff(samples["seq"].astype(int)) == 1)
+        if committed(running):
+            samples = Recording.open_run(path).samples  # readable, whatever it was doing
+            assert samples["seq"][-1] + 1 >= committed(running)
+            assert np.array_equal(samples["seq"], np.arange(len(samples)))
     last = Process(running, path)
     running.stop()
     assert last.end() == (0, "")
     run = running.require_whole(path)
     assert not run.is_truncated
-    assert len(run.parts) >= 2
+    assert len(run.parts) > KILLS
 
 
 def test_recorder__file_full_of_its_size__continues_in_parts_without_a_gap(tmp_path):
@@ -352,11 +362,6 @@ def cut(tmp_path_factory):
     return path
 
 
-def test_report__cut_recording__is_written_and_says_so(cut, tmp_path):
-    page = write_report(cut, tmp_path / "report")
-    assert "ends early" in page.with_suffix(".md").read_text()
-
-
 def test_export__cut_recording__rows_of_what_is_there(cut, tmp_path):
     recording = Recording.open(cut)
     with (tmp_path / "run.csv").open("w", newline="") as file:
@@ -377,7 +382,7 @@ def test_writer__part__stands_in_the_metadata(tmp_path):
 
 def test_daemon__recorder_killed_again_and_again_in_parts__whole_run_replays_identically(lab):
     lab.emulate()
-    arm = lab.run("recording.max_size_MB=0.3")
+    arm = lab.run("recording.max_size_MB=0.1")
     arm.client.command("enable")
     arm.swing()
     for _ in range(2):
@@ -387,7 +392,7 @@ def test_daemon__recorder_killed_again_and_again_in_parts__whole_run_replays_ide
         wait_until(
             lambda old=before: arm.daemon.children().get("recorder", old) != old, what="a new one"
         )
-        arm.wait_cycles(500)
+        arm.wait_cycles(200)
     assert arm.daemon.end() == 0
     run = Recording.open_run(arm.recording)
     assert len(run.parts) > 3
@@ -406,11 +411,13 @@ def run_config(recording):
     return config_from_json(json.dumps(recording.config))
 
 
-def test_daemon__all_processes_killed__file_readable_up_to_the_last_flush(lab):
+@pytest.mark.parametrize("number", range(KILLS_OF_ALL))
+def test_daemon__all_processes_killed__file_readable_up_to_the_last_flush(lab, number):
     lab.emulate()
     arm = lab.run()
     arm.client.command("enable")
     arm.swing()
+    time.sleep(random.uniform(0.0, 0.2))
     children = arm.daemon.children()
     for pid in (*children.values(), arm.daemon.pid):
         os.kill(pid, signal.SIGKILL)
@@ -420,5 +427,21 @@ def test_daemon__all_processes_killed__file_readable_up_to_the_last_flush(lab):
     assert recording.is_truncated
     assert np.all(np.diff(recording.samples["seq"].astype(int)) == 1)
     lost_s = (last_seen_ns - int(recording.samples["t_ns"][-1])) / 1e9
+    print(f"lost {lost_s * 1e3:.0f} ms")  # noqa: T201 - with -s, the figure
     assert lost_s < 0.1 + STALL_S
-    assert write_report(arm.recording, arm.recording.with_suffix("")).exists()
+
+
+def test_open_run__next_part_killed_at_its_first_bytes__is_left_out(tmp_path):
+    path = tmp_path / "run.mcap"
+    recorded(Source(), path, 100)
+    (tmp_path / "run-2.mcap").write_bytes(b"\x89MCAP")
+    assert Recording.open_run(path).parts == (path,)
+
+
+def test_export__whole_run__rows_of_all_parts(tmp_path, capsys):
+    source, path = Source(max_size_MB=0.05), tmp_path / "run.mcap"
+    recorded(source, path, 500)
+    assert main(["export", str(path), "--csv", "-", "--whole-run"]) == 0
+    assert capsys.readouterr().out.count("\n") == 1 + source.cycles
+    assert main(["export", str(path), "--csv", "-"]) == 0
+    assert 1 < capsys.readouterr().out.count("\n") < source.cycles
