@@ -64,8 +64,8 @@ class Axis(ABC):
         q_rad: Joint angle of the last fresh feedback.
         dq_rad_s: Joint rate the amplifier reported with it; None if the family reports none.
         tau_meas_Nm: Joint torque the amplifier reported with it.
-        age_cycles: Cycles since that feedback; 0 = fresh. Between two cycles, -1 = it came since the
-            last one, from an amplifier that sends by its own clock, and counts for the next.
+        age_cycles: Cycles since that feedback; 0 = fresh. Between two cycles, -1 = it came since
+            the last one, from an amplifier that sends by its own clock, and counts for the next.
         status: What the amplifier says of itself.
         note: One line about the last fault or emergency message, empty if there was none.
         uses_sync: The family needs a CANopen SYNC at the start of each cycle.
