@@ -37,7 +37,7 @@ test: $(STAMP) lint ## everything CI runs
 
 # The soak takes HIL_SOAK_S seconds (600), each fuzz test FUZZ frames. Nothing may run beside the soak.
 nightly: $(STAMP) pythons ## soak, whole scenarios twice and on other Pythons, long fuzzing: an hour or two
-	HIL_NIGHTLY=1 $(BIN)/python -m pytest -s tests/nightly
+	HIL_NIGHTLY=1 HIL_FUZZ_FRAMES=$(FUZZ) $(BIN)/python -m pytest -s tests/nightly
 	HIL_NIGHTLY=1 $(BIN)/python -m pytest --timeout 7200 tests/hil/test_determinism.py tests/hil/test_fault_matrix.py
 	$(FUZZ_COUNTS) $(BIN)/python -m pytest -o timeout=7200 -k "fuzz or random_and_mutated" tests/drivers tests/sim_backend
 

@@ -188,8 +188,9 @@ TABLES = st.fixed_dictionaries(
                           "on_gateway_loss": st.sampled_from(["finish", "hold", "stop"])},
         ),
         "zenoh": st.fixed_dictionaries(
-            {}, optional={"listen": st.lists(st.text(max_size=20), max_size=3),
-                          "mode": st.sampled_from(["peer", "client", "router"])},
+            {"allow_open": st.just(True)},
+            optional={"listen": st.lists(st.text(max_size=20), max_size=3),
+                      "mode": st.sampled_from(["peer", "client", "router"])},
         ),
         "axes": st.dictionaries(
             st.sampled_from(["1", "2"]),

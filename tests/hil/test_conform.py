@@ -4,6 +4,7 @@ The nodes are emulated ones on a real hub, served by a thread; the bad ones are 
 """
 
 import json
+import re
 import signal
 import tempfile
 import threading
@@ -119,7 +120,7 @@ def test_kit__emulated_drive_in_lockstep__passes_every_step():
     assert {name: r.detail for name, r in results.items() if r.outcome is not Outcome.PASS} == {}
     assert list(results) == NAMES
     loss = results["loss of commands"]
-    assert "removed 21 ms after its command" in loss.detail
+    assert re.search(r"removed 2\d ms after its command", loss.detail)
     assert "EMCY 8250" in loss.detail
 
 

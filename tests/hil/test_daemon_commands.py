@@ -161,7 +161,7 @@ def test_gain_bounds__above_ceiling__refused_with_joint_value_and_limit(arm, sta
         ("trajectory", {"kind": "move", "target_rad": [0.1, 9.0]}, "joint 2: target 9"),
         ("trajectory", {"kind": "kelly", "duration_s": 500.0}, "beyond the longest allowed"),
         ("trajectory", {"kind": "spline"}, "spline"),
-        ("fault", {"target": "bus", "kind": "garbage"}, "not available"),
+        ("fault", {"target": "bus", "kind": "garbage", "duration_s": 0}, "duration_s"),
         ("fault", {"target": "amplifier", "kind": "off", "joint": 3}, "the arm has 2 joints"),
         ("enable", {}, "enable is not possible in state"),
         ("reset", {}, "nothing to reset"),

@@ -19,6 +19,8 @@ from tests.drivers.axis_rig import TICKS, AxisRig
 
 FRAMES = int(os.environ.get("HIL_FUZZ_FRAMES", "1000000"))
 PER_CYCLE = 10
+TOLERANCE = 1.001
+"""A drive's own largest torque is a whole number of its units, per mille of the rated one."""
 
 pytestmark = [
     pytest.mark.nightly,
@@ -53,7 +55,7 @@ def test_family__random_frames_to_both_sides__no_exception_and_torque_within_lim
                 rig.emulator.receive(frame)
         rig.cycle(chance.uniform(-1e3, 1e3), chance.uniform(-1e3, 1e3))
         for servo, axis in zip(rig.servos, rig.axes, strict=True):
-            assert abs(servo.torque_target_Nm) <= servo.torque_max_Nm * (1 + 1e-9)
+            assert abs(servo.torque_target_Nm) <= servo.torque_max_Nm * TOLERANCE
             assert axis.status in AxisStatus
             assert math.isfinite(axis.q_rad)
         if number % 200 == 0 and not rig.bus.is_enabled:  # to be in every state again and again
