@@ -186,6 +186,7 @@ def test_parameters__two_links__those_written_out():
 def settings(name: str, n: int = 2, tau_max_Nm: float = AMPLE_NM, **tables) -> ControllerSettings:
     limits = dict.fromkeys(LimitSettings.model_fields, (1.0,) * n)
     limits |= {"hard_margin_rad": 0.1, "n_hold": 5, "n_damp": 20, "stop_timeout_s": 2.0}
+    limits |= {"lowering_rad_s": 0.5, "lowering_timeout_s": 8.0}
     limits |= {"q_min_rad": (-1.0,) * n, "tau_max_Nm": (tau_max_Nm,) * n}
     law = {
         "name": name,

@@ -28,6 +28,7 @@ LAWS = {
 def settings(**law) -> ControllerSettings:
     limits = dict.fromkeys(LimitSettings.model_fields, (1.0, 1.0))
     limits |= {"hard_margin_rad": 0.1, "n_hold": 5, "n_damp": 20, "stop_timeout_s": 2.0}
+    limits |= {"lowering_rad_s": 0.5, "lowering_timeout_s": 8.0}
     limits |= {"q_min_rad": (-1.0, -1.0), "tau_max_Nm": TAU_MAX_NM}
     link = {"length_m": 0.25, "com_m": 0.1, "mass_kg": 1.0, "inertia_kg_m2": 0.03}
     return ControllerSettings(law=law, limits=limits, model={"links": [link, link]})
