@@ -41,6 +41,8 @@ class Retention:
             space = os.statvfs(folder)
         except OSError:  # creating a file there will say what is wrong
             return ""
+        if not space.f_blocks:  # no disk at all: creating a file there will tell
+            return ""
         free_MB = space.f_bavail * space.f_frsize / MB
         if free_MB >= self._min_free_MB:
             return ""
