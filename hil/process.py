@@ -9,7 +9,7 @@ from time import monotonic, sleep
 from hil.shared import SharedMemory
 
 OUTLAST_EVERY_S = 0.02
-SILENCE_S = 0.3
+SILENCE_S = 1.0
 """A loop that has not shown itself for this long has ended."""
 
 
