@@ -15,6 +15,8 @@ from hil.conform_pulse import (
     torque_resolution_Nm,
 )
 
+LOCKSTEP_MARGIN_S = 0.25
+"""An emulator that leaves lockstep notices that a while after its time-out."""
 SETTLED_CYCLES = 50
 """Cycles over which something has to stay as it is."""
 FRESH_SHARE = 0.9
@@ -206,7 +208,7 @@ def loss_of_master(bench: Bench) -> str:
     tau_Nm = _apply_before_loss(bench)
     silence_s = _watchdog_time_s(bench)
     if bench.is_lockstep:
-        silence_s += bench.timing.stall_timeout_s
+        silence_s += bench.timing.stall_timeout_s + LOCKSTEP_MARGIN_S
     bench.rest(silence_s)
     for _ in range(SETTLED_CYCLES):
         if not bench.listen():

@@ -261,10 +261,10 @@ class Replayer:
 
 def _refuse_black_box(recording: Recording) -> None:
     box = next((event for event in recording.events if event.kind == "black_box"), None)
-    if box is not None and recording.samples["seq"][0] > 0:
+    if box is not None:
         raise ReplayError(
             f"{recording.path} is a black box that begins in cycle {recording.samples['cycle'][0]}:"
-            f" the controller's state there is in no frame; replay {box.detail['recording']}"
+            f" state and references before it are not in it; replay {box.detail['recording']}"
         )
 
 
