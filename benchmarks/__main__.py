@@ -9,8 +9,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.measure import Target
+from hil.host_checks import is_optimised_build
 
-NAMES = ("cycle", "exchange", "sim", "law", "arm", "codec", "recording")
+NAMES = ("cycle", "exchange", "buses", "scale", "sim", "law", "arm", "codec", "recording", "remote")
 LIBRARIES = ("python-can", "canopen", "pymunk", "numpy", "protobuf", "mcap")
 
 
@@ -44,7 +45,8 @@ def print_header() -> None:
     cores, load = os.cpu_count(), os.getloadavg()[0]
     print(f"machine    {_processor()}, {cores} cores, load {load:.2f} at the start")
     print(f"kernel     {platform.system()} {platform.release()} {platform.version()}")
-    print(f"python     {platform.python_implementation()} {platform.python_version()}")
+    build = "with" if is_optimised_build() else "WITHOUT"
+    print(f"python     {platform.python_implementation()} {platform.python_version()} {build} PGO")
     print(f"libraries  {', '.join(f'{name} {version(name)}' for name in LIBRARIES)}")
 
 

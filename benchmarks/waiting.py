@@ -10,18 +10,20 @@ class WaitTimer(Bus):
     """Another bus, with the waiting in `recv` done and timed out here if so wished.
 
     Untimed, `send` and `recv` are the other bus's own methods, without any detour. Timed, a
-    `recv` that may wait first waits for the descriptor, so that the other bus finds its frame.
+    `recv` that may wait first waits for the descriptor, asleep or by looking again and again, so
+    that the other bus finds its frame.
 
     Attributes:
         waited_ns: Time waited; set it to 0 where counting is to begin.
     """
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus, *, is_spinning: bool = False) -> None:
         super().__init__()
         self.stats = bus.stats
         self.waited_ns = 0
         self._bus = bus
         self._readable = (bus.fileno(),)
+        self._is_spinning = is_spinning
         self.set_timed(False)
 
     def set_timed(self, is_timed: bool) -> None:
@@ -31,7 +33,11 @@ class WaitTimer(Bus):
     def _recv_timed(self, timeout_s: float) -> bytes | None:
         if timeout_s > 0.0:
             start_ns = perf_counter_ns()
-            select.select(self._readable, (), (), timeout_s)
+            deadline_ns = start_ns + timeout_s * 1e9 if self._is_spinning else 0
+            patience_s = 0.0 if self._is_spinning else timeout_s
+            while not select.select(self._readable, (), (), patience_s)[0]:
+                if perf_counter_ns() > deadline_ns:
+                    break
             self.waited_ns += perf_counter_ns() - start_ns
         return self._bus.recv(timeout_s)
 

@@ -114,9 +114,10 @@ class SelfTuningGain(Gain):
         step = self._rate_per_s * dt_s * (abs(S) if self._is_absolute else S)
         big, medium, small = self._mu
         beta = self.beta
-        beta[BIG] = self._box(beta[BIG] + step * big)
-        beta[MEDIUM] = self._box(beta[MEDIUM] + step * medium)
-        beta[SMALL] = self._box(beta[SMALL] + step * small)
+        low, high = self.Kd_min, self.Kd_max
+        for place, degree in ((BIG, big), (MEDIUM, medium), (SMALL, small)):
+            moved = beta[place] + step * degree
+            beta[place] = low if moved < low else moved if moved < high else high
 
     def _box(self, beta: float) -> float:
         if beta < self.Kd_min:

@@ -47,8 +47,10 @@ STREAMS: Final = {
     "event": "JSON object: `t_ns`, `cycle`, `kind` and what belongs to the kind, see Events",
 }
 QUERYABLES: Final = {
-    "schema": "JSON Schema of every command's request, by command, and of `reply`",
+    "schema": "JSON Schema of every command's request, by command, and of `reply`; `version` of "
+    "these; `proto`, the text of `telemetry.proto`",
     "config": "the running configuration as JSON, of the form of the TOML file",
+    "status": "the last status, for those who come late",
 }
 EVENTS: Final = {
     "start": "the loop runs: `amplifiers`, `is_lockstep`, `scheduler`, `kernel`, `machine`",
@@ -298,12 +300,14 @@ is for all others, and `hil/ARM/schema` answers it to programs.
     rows = [(f"`{key}`", text) for key, text in QUERYABLES.items()]
     rows += [(f"`cmd/{name}`", "takes the request below, answers a reply") for name in commands]
     rows.append(("`alive`", "liveliness token: there while the daemon's gateway is"))
+    rows.append(("`operator/NAME`", "liveliness token of an operator's session, declared by it"))
     yield from table(("key", "what it answers"), rows)
     yield "## Requests and the reply"
     yield ""
     yield (
         "JSON objects; SI units, angles in rad, lists have one entry per joint, shoulder first. A"
-        " field that is not known is refused. A refusal has changed nothing."
+        " field that is not known is refused. A refusal has changed nothing. [Remote"
+        " operation](../remote.md) says what `lease`, `request_id` and `sent_ns` are for."
     )
     yield ""
     for name, schema in known.items():

@@ -71,12 +71,13 @@ def dbc_path(axis: AxisSettings) -> Path | None:
     return Path(__file__).parent / folder / known.dbc
 
 
-def arm_database(axes: Sequence[AxisSettings]) -> Database:
+def arm_database(axes: Sequence[AxisSettings], bus: int = 1) -> Database:
     """Put together the frames of an arm, each axis under its own identifiers and in SI units.
 
     Args:
         axes: Settings of the axes, shoulder first; messages of the first are named `J1_...`.
             Families without a DBC file are left out.
+        bus: Number of the bus; axes on others are left out, and keep their numbers.
 
     Raises:
         DatabaseError: If cantools is not installed.
@@ -85,10 +86,11 @@ def arm_database(axes: Sequence[AxisSettings]) -> Database:
     from cantools.database.can import Database, Node
 
     messages: dict[int, Message] = {}
-    for joint, axis in enumerate(axes, start=1):
-        for message in _axis_messages(axis, f"J{joint}"):
+    joints = [(f"J{joint}", a) for joint, a in enumerate(axes, start=1) if a.bus == bus]
+    for name, axis in joints:
+        for message in _axis_messages(axis, name):
             messages.setdefault(message_key(message), message)
-    names = ["Master", *(f"J{joint}" for joint in range(1, len(axes) + 1))]
+    names = ["Master", *(name for name, _ in joints)]
     nodes = [Node(name) for name in names]
     return Database(messages=list(messages.values()), nodes=nodes, version="")
 

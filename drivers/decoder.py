@@ -34,14 +34,14 @@ class DecodedFrame(NamedTuple):
 
 
 class FrameDecoder:
-    """Decodes records by an arm's database. Bytes from the wire never raise.
+    """Decodes records from one of an arm's buses by its database. Bytes from it never raise.
 
     Raises:
         DatabaseError: If cantools is not installed.
     """
 
-    def __init__(self, axes: Sequence[AxisSettings]) -> None:
-        database = arm_database(axes)
+    def __init__(self, axes: Sequence[AxisSettings], bus: int = 1) -> None:
+        database = arm_database(axes, bus)
         from cantools.database.errors import Error
 
         self._failures = (Error, ValueError, KeyError)

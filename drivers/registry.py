@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import Field
 
@@ -13,6 +13,7 @@ from drivers.moteus.settings import MoteusSettings
 from drivers.odrive.settings import OdriveSettings
 from drivers.settings import AxisSettings
 
+_Settings = TypeVar("_Settings", bound=AxisSettings)
 AnyAxisSettings = Annotated[
     Cia402Settings | MitSettings | MoteusSettings | OdriveSettings, Field(discriminator="family")
 ]
@@ -54,13 +55,19 @@ def heartbeat_cycles(settings: Sequence[AxisSettings], *, period_s: float) -> in
     return max(1, round(min(intervals_ms) * 1e-3 / period_s)) if intervals_ms else 0
 
 
+def axes_by_bus(settings: Sequence[_Settings]) -> list[list[_Settings]]:
+    """Return the axes of each bus, in the order of the buses' numbers; some may have none."""
+    count = max((axis.bus for axis in settings), default=1)
+    return [[axis for axis in settings if axis.bus == number] for number in range(1, count + 1)]
+
+
 def find_clash(settings: Sequence[Any]) -> str:
-    """Say in one line which two axes use one identifier for two things; empty if none do."""
-    uses: dict[int, tuple[str, str]] = {}
+    """Say in one line which two axes of a bus use one identifier for two things; empty if none."""
+    uses: dict[tuple[int, int], tuple[str, str]] = {}
     for joint, axis in enumerate(settings, start=1):
         who = f"joint {joint} ({axis.family} node {axis.node})"
         for can_id, use in axis.identifiers().items():
-            other, other_use = uses.setdefault(can_id, (who, use))
+            other, other_use = uses.setdefault((axis.bus, can_id), (who, use))
             if use != other_use:
                 return (
                     f"identifier 0x{can_id:03X} is {use} of {who} and {other_use} of {other}; "

@@ -3,8 +3,16 @@
 from abc import ABC, abstractmethod
 from typing import Any, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 
+MOST_BUSES = 4
+"""So many buses one arm can have."""
 ACYCLIC = 100
 """`CycleFrame.every` of what comes now and then: at most one in so many cycles."""
 
@@ -35,6 +43,17 @@ class AxisSettings(BaseModel, ABC):
         1, description="+1 if the amplifier counts up and pushes along the joint's +z axis"
     )
     offset_rad: float = Field(0.0, description="joint angle at encoder count zero")
+    bus: int = Field(
+        1, ge=1, le=MOST_BUSES, description="1 is `bus.address`, 2 the first of `bus.more`"
+    )
+
+    @model_serializer(mode="wrap")
+    def _leave_out_first_bus(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A configuration of one bus reads as it did when there were no others."""
+        table: dict[str, Any] = dump(self)
+        if self.bus == 1:
+            table.pop("bus", None)
+        return table
 
     @classmethod
     @abstractmethod
@@ -49,7 +68,16 @@ class AxisSettings(BaseModel, ABC):
     @property
     @abstractmethod
     def node(self) -> int:
-        """The amplifier's number on the bus, unique among the axes of its family."""
+        """The amplifier's number on its bus, unique among the axes of its family there."""
+
+    @property
+    def watchdog_s(self) -> float | None:
+        """After so long without a command the amplifier takes torque off by itself.
+
+        None: nothing in the protocol makes it do so, or nothing over the bus can tell whether it
+        does. Torque may then stay on when the master dies.
+        """
+        return None
 
     @property
     def master_heartbeat_ms(self) -> int:

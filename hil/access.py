@@ -25,7 +25,7 @@ PASSWORDS_FILE: Final = "passwords.txt"
 
 _STREAMS: Final = ["hil/*/telemetry", "hil/*/status", "hil/*/event"]
 _PRESENCE: Final = ["hil/*/alive", "hil/*/operator/*"]
-_READABLE: Final = ["hil/*/schema", "hil/*/config"]
+_READABLE: Final = ["hil/*/schema", "hil/*/config", "hil/*/status"]
 _ALL_MESSAGES: Final = [
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
     "liveliness_token", "declare_liveliness_subscriber", "liveliness_query",

@@ -1,5 +1,7 @@
 """The bus budget: what a cycle puts on the wire at worst, against what a period has room for.
 
+Each bus of an arm has a budget of its own; what fits on one does not help another.
+
 Lengths are worst-case ones, stuffed as densely as CAN allows (`drivers.frame`); what the families
 send, their settings say (`AxisSettings.cycle_frames`).
 """
@@ -9,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from drivers.frame import worst_case_bits, worst_case_fd_bits
+from drivers.registry import axes_by_bus
 from drivers.settings import AxisSettings, CycleFrame
 from hil.config import BusSettings, Config, ConfigError
 
@@ -109,8 +112,14 @@ class Budget:
 
 
 def bus_budget(config: Config) -> Budget:
-    """Return the budget of a configuration."""
-    return budget_of(config.axes, config.bus, config.loop.period_s)
+    """Return the budget of a configuration; of several buses, that of the fullest one."""
+    return max(bus_budgets(config), key=lambda budget: budget.share)
+
+
+def bus_budgets(config: Config) -> list[Budget]:
+    """Return the budget of each bus, in the order of their numbers."""
+    period_s = config.loop.period_s
+    return [budget_of(axes, config.bus, period_s) for axes in axes_by_bus(config.axes)]
 
 
 def budget_of(axes: Sequence[AxisSettings], bus: BusSettings, period_s: float) -> Budget:
@@ -141,18 +150,19 @@ def _line(label: str, frame: CycleFrame, count: int, bus: BusSettings) -> Budget
 
 
 def require_fit(config: Config) -> None:
-    """Refuse a configuration whose cycle does not fit on the bus.
+    """Refuse a configuration whose cycle does not fit on one of its buses.
 
     Raises:
         ConfigError: With the arithmetic.
     """
-    budget = bus_budget(config)
-    if not budget.is_fitting:
-        raise ConfigError(
-            f"the cycle does not fit on the bus: {budget.arithmetic()} at worst "
-            f"({100 * budget.share:.1f} %), the period has {1e6 * budget.period_s:.0f} us at "
-            f"{config.bus.bit_rate} bit/s; {REMEDY}"
-        )
+    for number, budget in enumerate(bus_budgets(config), start=1):
+        if not budget.is_fitting:
+            which = f"bus {number}" if config.bus.more else "the bus"
+            raise ConfigError(
+                f"the cycle does not fit on {which}: {budget.arithmetic()} at worst "
+                f"({100 * budget.share:.1f} %), the period has {1e6 * budget.period_s:.0f} us at "
+                f"{config.bus.bit_rate} bit/s; {REMEDY}"
+            )
 
 
 def budget_table(budget: Budget) -> str:

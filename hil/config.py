@@ -10,7 +10,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 from pydantic_settings import (
     BaseSettings,
     EnvSettingsSource,
@@ -22,11 +30,13 @@ from controller.settings import ControllerSettings, LinkModel, ModelSettings
 from drivers.bus import split_address
 from drivers.cia402.settings import Cia402Settings
 from drivers.errors import DriverError
-from drivers.registry import SETTINGS, AnyAxisSettings, find_clash
+from drivers.registry import SETTINGS, AnyAxisSettings, axes_by_bus, find_clash
+from drivers.settings import MOST_BUSES
+from hil.chain_gains import C_RAD_S2, chain_controller
 from hil.endpoints import reachable
 from hil.errors import HilError
 from sim_backend.errors import SimError
-from sim_backend.presets import plant_preset, servo_preset
+from sim_backend.presets import is_chain, plant_preset, servo_preset
 from sim_backend.settings import EmulatorSettings, PlantSettings, ServoSettings
 
 DEFAULT_PRESET = "bench_h"
@@ -48,13 +58,31 @@ class ArmSettings(_Settings):
 
 
 class BusSettings(_Settings):
-    """The bus the amplifiers are on."""
+    """The bus the amplifiers are on, or the buses."""
 
     address: str = Field("unix:/tmp/hil-bench.sock", description="see `hil run --help`")
+    more: tuple[str, ...] = Field(
+        (),
+        max_length=MOST_BUSES - 1,
+        description="addresses of buses 2, 3 and 4; `axes.N.bus` says where an amplifier is",
+    )
     bit_rate: int = Field(1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the budget")
     data_bit_rate: int = Field(
         5_000_000, ge=10_000, le=8_000_000, description="the same for the data of CAN FD frames"
     )
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """Of all buses, in the order of their numbers."""
+        return (self.address, *self.more)
+
+    @model_serializer(mode="wrap")
+    def _leave_out_no_more(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A configuration of one bus reads as it did when there were no others."""
+        table: dict[str, Any] = dump(self)
+        if not self.more:
+            table.pop("more", None)
+        return table
 
 
 class LoopSettings(_Settings):
@@ -125,6 +153,28 @@ class ZenohSettings(_Settings):
         return self
 
 
+class RemoteSettings(_Settings):
+    """Authority: who may move the arm over the network, and for how long."""
+
+    on_operator_loss: Literal["finish", "hold", "stop"] = Field(
+        "hold",
+        description="when the operator's program or link dies in mid-motion: finish the "
+        "trajectory, then hold; hold: slow down now; stop: damped, then power off",
+    )
+    max_age_s: float = Field(
+        10.0, gt=0, le=60, description="requests that are older when their turn comes are refused"
+    )
+    idle_s: float | None = Field(
+        900.0,
+        gt=0,
+        description="an operator who asks for nothing for so long, and whose arm does not move, "
+        "loses authority to whoever asks next; none = never",
+    )
+    reconnect_s: float = Field(
+        10.0, gt=0, le=60, description="time the operator has to reconnect to a restarted gateway"
+    )
+
+
 class RecordingSettings(_Settings):
     """Where runs are recorded, and how much of the disk they may take."""
 
@@ -166,6 +216,7 @@ class Config(BaseSettings):
     loop: LoopSettings = LoopSettings()
     trajectory: TrajectorySettings = TrajectorySettings()
     zenoh: ZenohSettings = ZenohSettings()
+    remote: RemoteSettings = RemoteSettings()
     recording: RecordingSettings = RecordingSettings()
     plant: PlantSettings = Field(description="the emulated arm")
     servos: tuple[ServoSettings, ...] = Field(description="the emulated motors")
@@ -205,20 +256,45 @@ class Config(BaseSettings):
             if len(given) != joints:
                 raise ValueError(f"{name} has {len(given)} entries, axes has {joints}")
         self.controller.require_joints(joints)
-        nodes = [(axis.family, axis.node) for axis in self.axes]
-        if len(set(nodes)) != joints:
-            shown = ", ".join(f"{family} {node}" for family, node in nodes)
-            raise ValueError(f"axes: node ids ({shown}) are not all different")
+        self._check_buses()
+        for number, axes in enumerate(axes_by_bus(self.axes), start=1):
+            nodes = [(axis.family, axis.node) for axis in axes]
+            if len(set(nodes)) != len(nodes):
+                shown = ", ".join(f"{family} {node}" for family, node in nodes)
+                where = f" on bus {number}" if self.bus.more else ""
+                raise ValueError(f"axes: node ids ({shown}){where} are not all different")
         if clash := find_clash(self.axes):
             raise ValueError(f"axes: {clash}")
         if self.loop.feedback_timeout_s >= self.loop.period_s:
             raise ValueError("loop.feedback_timeout_s must be shorter than loop.period_s")
         return self
 
+    def _check_buses(self) -> None:
+        addresses = self.bus.addresses
+        if len(set(addresses)) != len(addresses):
+            raise ValueError(f"bus.more: {', '.join(addresses)} are not all different")
+        used = {axis.bus for axis in self.axes}
+        for joint, axis in enumerate(self.axes, start=1):
+            if axis.bus > len(addresses):
+                raise ValueError(
+                    f"axes.{joint}.bus is {axis.bus}, there {_buses(len(addresses))}; "
+                    "add addresses to bus.more"
+                )
+        for number in range(1, len(addresses) + 1):
+            if number not in used:
+                raise ValueError(
+                    f"no axis is on bus {number} ({addresses[number - 1]}); "
+                    f"set axes.N.bus = {number}, or leave the bus out"
+                )
+
     @property
     def joints(self) -> int:
         """Number of joints."""
         return len(self.axes)
+
+
+def _buses(number: int) -> str:
+    return "is 1 bus" if number == 1 else f"are {number} buses"
 
 
 def preset_defaults(name: str) -> dict[str, Any]:
@@ -231,7 +307,7 @@ def preset_defaults(name: str) -> dict[str, Any]:
     model = _nominal_model(plant)
     tau_max = [servo.torque_constant_Nm_A * servo.current_max_A for servo in servos]
     n = len(servos)
-    limits = {
+    limits: dict[str, Any] = {
         "q_min_rad": [-2.8] * n,
         "q_max_rad": [2.8] * n,
         "dq_max_rad_s": [4.0] * n,
@@ -244,10 +320,15 @@ def preset_defaults(name: str) -> dict[str, Any]:
         "damping_Nms_rad": [1.0] * n,
     }
     axes = [Cia402Settings.defaults(j, tau) for j, tau in enumerate(tau_max, start=1)]
+    controller: dict[str, Any] = {"limits": limits, "model": model}
+    if is_chain(name):
+        law, fitting = chain_controller(plant)
+        velocity = {"C_rad_s2": [C_RAD_S2] * n}
+        controller |= {"law": law, "limits": limits | fitting, "velocity": velocity}
     return {
         "arm": {"preset": name},
         "axes": axes,
-        "controller": {"limits": limits, "model": model},
+        "controller": controller,
         "plant": plant.model_dump(),
         "servos": [servo.model_dump() for servo in servos],
     }
@@ -336,7 +417,8 @@ def load_config(path: str | None = None, overrides: Mapping[str, Any] | None = N
     data = _read_toml(path) if path else {}
     try:
         config = Config(**merge(merge(data, EnvSettingsSource(Config)()), overrides or {}))
-        split_address(config.bus.address)
+        for address in config.bus.addresses:
+            split_address(address)
     except ValidationError as error:
         raise ConfigError(f"{source}: {_first_problem(error)}") from error
     except (ValueError, DriverError) as error:

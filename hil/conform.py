@@ -10,7 +10,7 @@ from enum import Enum
 
 from drivers.axis import AxisStatus
 from drivers.errors import DriverError
-from hil.conform_bench import Bench, LoggedFrame, NotAskedError, StepError
+from hil.conform_bench import Bench, LoggedFrame, NotAskedError, NotOfferedError, StepError
 
 STALL_PERIODS = 5
 """A host that is late by more than this cannot judge a drive."""
@@ -22,6 +22,7 @@ class Outcome(Enum):
     """How a step ended."""
 
     PASS = "pass"  # noqa: S105 - no password
+    WARN = "WARN"
     FAIL = "FAIL"
     NOT_ASKED = "not asked"
     NOT_REACHED = "not reached"
@@ -45,7 +46,7 @@ class Step:
 
     name: str
     run: Callable[[Bench], str]
-    """Returns what was measured; raises `StepError` or `NotAskedError`."""
+    """Returns what was measured; raises `StepError`, `NotOfferedError` or `NotAskedError`."""
     begins: AxisStatus | None = None
     """Status to bring the axis to first."""
     is_vital: bool = False
@@ -102,5 +103,7 @@ def _attempt(bench: Bench, step: Step) -> tuple[Outcome, str]:
         return Outcome.PASS, step.run(bench)
     except NotAskedError as error:
         return Outcome.NOT_ASKED, str(error)
+    except NotOfferedError as error:
+        return Outcome.WARN, str(error)
     except (StepError, DriverError) as error:
         return Outcome.FAIL, str(error)

@@ -32,6 +32,10 @@ class NotAskedError(HilError):
     """The step does not apply to this amplifier; the message says why."""
 
 
+class NotOfferedError(HilError):
+    """The family has nothing that the step could find; the message says what is to be done."""
+
+
 @dataclass(frozen=True, slots=True)
 class Limits:
     """What the run may do to the joint.
@@ -43,6 +47,7 @@ class Limits:
         travel_rad: Torque goes off when the joint is this far from where it was at the start.
         tolerance: Allowed deviation of the reported torque from the commanded one, as a share.
         watchdog_s: The drive has to remove torque after this long without a command.
+        has_watchdog: It has one that can be relied on; without, torque that stays on is a warning.
         state_report_s: The state may be reported this late, in families that do not report it with
             every feedback.
         torque_report_s: The same of torque.
@@ -61,6 +66,7 @@ class Limits:
     enable_s: float = 1.0
     is_clamped: bool = False
     may_inject: bool = False
+    has_watchdog: bool = True
 
 
 @dataclass(frozen=True, slots=True)

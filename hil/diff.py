@@ -4,6 +4,7 @@ import hashlib
 from dataclasses import dataclass
 from itertools import zip_longest
 
+from drivers.arm_group import split_bus
 from hil.recording import Recording
 from hil.replay import Difference, first_difference
 from hil.telemetry import SENT, LoggedFrame
@@ -64,7 +65,9 @@ def _frames(a: Recording, b: Recording, with_timing: bool) -> Difference | None:
 def _tell(frame: LoggedFrame | None) -> str:
     if frame is None:
         return "none"
-    return f"{'sent' if frame.direction == SENT else 'received'} {frame.frame.hex()}"
+    bus, way = split_bus(frame.direction)
+    where = f" on bus {bus}" if bus > 1 else ""
+    return f"{'sent' if way == SENT else 'received'}{where} {frame.frame.hex()}"
 
 
 def _cycle_at(recording: Recording, t_ns: int) -> int:

@@ -7,6 +7,7 @@ import json
 import sys
 import threading
 import traceback
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from time import monotonic, sleep
 from typing import Any
@@ -22,11 +23,13 @@ from hil import messages
 from hil.config import Config
 from hil.errors import HilError
 from hil.messages import (
+    AcquireRequest,
     DisableRequest,
     EnableRequest,
     EstopRequest,
     FaultRequest,
     GainBoundsRequest,
+    ReleaseRequest,
     Reply,
     Request,
     RequestError,
@@ -89,9 +92,15 @@ def check_gain_bounds(request: GainBoundsRequest, config: Config) -> None:
 
 
 class Dispatcher:
-    """Answers requests: one thread for those in `URGENT`, one for all others."""
+    """Answers requests: one thread for those in `URGENT`, one for all others.
+
+    Attributes:
+        permits: Whether an operator may still command when a command is handed to the loop; it may
+            have taken seconds to plan.
+    """
 
     def __init__(self, shared: SharedMemory) -> None:
+        self.permits: Callable[[str], bool] = lambda _operator: True
         self._shared = shared
         self._config = shared.config
         self._limits = MotionLimits.of(
@@ -125,6 +134,15 @@ class Dispatcher:
             row["q_des_rad"].tolist(),
         )
 
+    def is_moving(self) -> bool:
+        """The arm follows a trajectory, or comes to a stop."""
+        return self.present.state in (State.ACTIVE, State.STOPPING)
+
+    def inform(self, command: Mapping[str, Any]) -> None:
+        """Pass a command on to the loop that nobody waits for."""
+        with self._lock:
+            self._shared.commands.append(json.dumps(command).encode())
+
     def forestall(self, verb: str, payload: bytes) -> None:
         """Pass an emergency stop on to the loop at once; its answer may wait for its turn."""
         if verb != "estop":
@@ -136,12 +154,19 @@ class Dispatcher:
         self._shared.request_estop()
 
     def answer(self, verb: str, payload: bytes) -> Reply:
-        """Carry out one request. Never raises: its thread has others to answer."""
-        request_id = None
+        """Read and carry out one request. Never raises: its thread has others to answer."""
         try:
             request = messages.parse(verb, payload)
-            request_id = request.request_id
-            return self._carry_out(verb, request).model_copy(update={"request_id": request_id})
+        except RequestError as error:
+            return Reply(ok=False, reason=str(error))
+        return self.carry_out(verb, request)
+
+    def carry_out(self, verb: str, request: Request, operator: str | None = None) -> Reply:
+        """Carry out one request for an operator. Never raises."""
+        request_id = request.request_id
+        try:
+            reply = self._carry_out(verb, request, {"operator": operator} if operator else {})
+            return reply.model_copy(update={"request_id": request_id})
         except Refusal as refusal:
             return refusal.reply(request_id)
         except HilError as error:
@@ -151,28 +176,30 @@ class Dispatcher:
             reason = f"internal error in {verb}: {type(error).__name__}: {error}"
             return Reply(ok=False, reason=reason, request_id=request_id)
 
-    def _carry_out(self, verb: str, request: Request) -> Reply:
+    def _carry_out(self, verb: str, request: Request, who: dict[str, str]) -> Reply:
         if isinstance(request, GainBoundsRequest):
             check_gain_bounds(request, self._config)
-            return self._order(verb, Kd_min=request.Kd_min, Kd_max=request.Kd_max)
+            return self._order(verb, {"Kd_min": request.Kd_min, "Kd_max": request.Kd_max, **who})
         if isinstance(request, FaultRequest):
-            return self._inject(request)
+            return self._inject(request, who)
         if isinstance(request, StopRequest | ResetRequest):
-            return self._order(verb)
+            return self._order(verb, who)
         if isinstance(request, EnableRequest | DisableRequest | EstopRequest):
-            return self._until(verb)
-        return self._start(request)
+            return self._until(verb, who)
+        if isinstance(request, AcquireRequest | ReleaseRequest):
+            raise Refusal(f"{verb} is not for the arm")
+        return self._start(request, who)
 
     # --- plain commands ----------------------------------------------------------------------
 
-    def _order(self, verb: str, **arguments: object) -> Reply:
+    def _order(self, verb: str, arguments: Mapping[str, object]) -> Reply:
         """Send one command to the loop and return what became of it."""
         outcome = self._await_outcome(self._post(verb, arguments), OUTCOME_TIMEOUT_S)
-        return Reply(ok=outcome["ok"], reason=outcome["reason"])
+        return Reply(ok=outcome["ok"], reason=outcome["reason"], cycle=outcome["cycle"])
 
-    def _until(self, verb: str) -> Reply:
+    def _until(self, verb: str, who: Mapping[str, str]) -> Reply:
         """Send one command and wait until it has taken full effect, or the arm is in fault."""
-        outcome = self._await_outcome(self._post(verb, {}), OUTCOME_TIMEOUT_S)
+        outcome = self._await_outcome(self._post(verb, who), OUTCOME_TIMEOUT_S)
         if not outcome["ok"]:
             return Reply(ok=False, reason=outcome["reason"])
         deadline_s = monotonic() + self._patience_s[verb]
@@ -180,7 +207,7 @@ class Dispatcher:
             present = self.present
             if present.cycle >= outcome["cycle"]:  # earlier ones know nothing of it
                 if present.state in SETTLED[verb]:
-                    return Reply(ok=True)
+                    return Reply(ok=True, cycle=present.cycle)
                 if present.state is State.FAULT:
                     reason = f"{verb}: the arm went into FAULT ({present.fault.name})"
                     return Reply(ok=False, reason=reason)
@@ -188,9 +215,12 @@ class Dispatcher:
         return Reply(ok=False, reason=f"{verb}: still in state {self.present.state.name}")
 
     def _post(
-        self, verb: str, arguments: dict[str, Any], slot: tuple[int, int] | None = None
+        self, verb: str, arguments: Mapping[str, Any], slot: tuple[int, int] | None = None
     ) -> int:
+        operator = arguments.get("operator")
         with self._lock:
+            if verb != "estop" and operator is not None and not self.permits(operator):
+                raise Refusal(f"{verb}: {operator} has lost authority in the meantime")
             number = self._shared.commands.head  # no other command, of no other gateway, has it
             self._awaited[number] = {}
             if slot is not None:
@@ -224,22 +254,17 @@ class Dispatcher:
             if handed_over is not None and event["ok"]:
                 self._slot, self._samples = handed_over
 
-    def _inject(self, request: FaultRequest) -> Reply:
+    def _inject(self, request: FaultRequest, who: Mapping[str, str]) -> Reply:
         joint, joints = request.joint or 0, self._config.joints
         if joint > joints:
             reason = f"joint {joint}: the arm has {joints} joints"
             raise Refusal(reason, "joints", value=joint, limit=joints)
-        return self._order(
-            "fault",
-            joint=joint,
-            target=request.target,
-            kind=request.kind,
-            duration_s=request.duration_s,
-        )
+        order = request.model_dump(include={"target", "kind", "duration_s"})
+        return self._order("fault", {"joint": joint, **order, **who})
 
     # --- trajectories ------------------------------------------------------------------------
 
-    def _start(self, request: messages.TrajectoryRequest) -> Reply:
+    def _start(self, request: messages.TrajectoryRequest, who: Mapping[str, str]) -> Reply:
         """Plan from the reference in force, write a free slot, hand it over."""
         state = self.present.state
         if state not in (State.READY, State.ACTIVE, State.HOLD):
@@ -249,15 +274,15 @@ class Dispatcher:
         for lead in LEADS_TRIED:
             at_index, start = self._junction(lead * LEAD_S)
             reference = plan(request, start, self._limits, self._config.loop.period_s)
-            number = self._hand_over(reference, at_index)
+            number = self._hand_over(reference, at_index, who)
             outcome = self._await_outcome(number, lead * LEAD_S + OUTCOME_TIMEOUT_S)
             if outcome["ok"]:
-                return Reply(ok=True, duration_s=reference.duration_s)
+                return Reply(ok=True, duration_s=reference.duration_s, cycle=outcome["cycle"])
             if "reference has changed" not in outcome["reason"] and "late" not in outcome["reason"]:
                 break
         return Reply(ok=False, reason=outcome["reason"])
 
-    def _hand_over(self, reference: Reference, at_index: int | None) -> int:
+    def _hand_over(self, reference: Reference, at_index: int | None, who: Mapping[str, str]) -> int:
         slot = self._free_slot()
         rows = reference.rows()
         self._rows(slot, rows.size)[:] = rows.ravel()
@@ -266,6 +291,7 @@ class Dispatcher:
             "samples": reference.samples,
             "at_index": at_index,
             "crc32": crc32(rows.tobytes()),
+            **who,
         }
         return self._post("trajectory", command, (slot, reference.samples))
 

@@ -2,7 +2,6 @@
 
 import errno
 import json
-import platform
 import shutil
 import socket
 import subprocess
@@ -17,50 +16,50 @@ from hil.config import Config
 from hil.finding import Finding, Level
 from hil.host_checks import HOST_CHECKS, read
 from hil.session import SessionError, describe_access, find_open, make_config
+from hil.watchdogs import check_watchdogs
 
 _CONNECT_TIMEOUT_S = 1.0
 _NO_ACCESS = "no authentication"
 """What `describe_access` says of a daemon that only this host can reach."""
 _PROGRAM_TIMEOUT_S = 5.0
+_GRAVITY = {"pass": 0, "warn": 1, "fail": 2}
 
 
 def examine(config: Config) -> list[Finding]:
     """Run every check. Nothing is sent to an amplifier."""
     checks: tuple[Callable[[Config], Finding], ...] = (
-        _python,
         *HOST_CHECKS,
         _bus,
         _can_interface,
         check_bus_load,
+        check_watchdogs,
         _zenoh,
         _routers,
     )
     return [check(config) for check in checks]
 
 
-def _python(config: Config) -> Finding:
-    del config
-    return Finding(
-        "python", "pass", f"{platform.python_implementation()} {platform.python_version()}"
-    )
-
-
 def _bus(config: Config) -> Finding:
-    address = config.bus.address
-    try:
-        with open_bus(address):
-            pass
-    except DriverError as error:
-        return Finding("bus", "fail", str(error), "see the message")
-    return Finding("bus", "pass", f"{address} can be joined")
+    for address in config.bus.addresses:
+        try:
+            with open_bus(address):
+                pass
+        except DriverError as error:
+            return Finding("bus", "fail", str(error), "see the message")
+    return Finding("bus", "pass", f"{', '.join(config.bus.addresses)} can be joined")
 
 
 def _can_interface(config: Config) -> Finding:
-    scheme, interface = split_address(config.bus.address)
-    if scheme != "socketcan":
+    parts = [split_address(address) for address in config.bus.addresses]
+    interfaces = [interface for scheme, interface in parts if scheme == "socketcan"]
+    if not interfaces:
         return Finding("can interface", "pass", "the bus is none of the kernel's")
-    queue = read(Path(f"/sys/class/net/{interface}/tx_queue_len"))
-    return judge_can(config, interface, queue, _link_details(interface))
+    queues = [read(Path(f"/sys/class/net/{name}/tx_queue_len")) for name in interfaces]
+    findings = [
+        judge_can(config, name, queue, _link_details(name))
+        for name, queue in zip(interfaces, queues, strict=True)
+    ]
+    return max(findings, key=lambda finding: _GRAVITY[finding.level])
 
 
 def judge_can(config: Config, interface: str, queue: str, details: dict[str, Any]) -> Finding:
@@ -115,7 +114,8 @@ def _link_details(interface: str) -> dict[str, Any]:
 def check_bus_load(config: Config) -> Finding:
     """Judge the bus budget alone (`hil.budget`)."""
     budget = bus_budget(config)
-    found = f"a cycle needs {100 * budget.share:.1f} % of the period at worst"
+    where = " on the fullest bus" if config.bus.more else ""
+    found = f"a cycle needs {100 * budget.share:.1f} % of the period at worst{where}"
     if not budget.is_fitting:
         return Finding("bus load", "fail", f"{found}: {budget.arithmetic()}", REMEDY)
     if budget.share > WARNING_SHARE:

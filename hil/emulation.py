@@ -23,27 +23,34 @@ from sim_backend.odrive.node import OdriveNode, OdriveNodeSettings
 from sim_backend.servo import Servo
 from sim_backend.settings import EmulatorSettings
 from sim_backend.timed_hub import TimedHub
+from sim_backend.wire_group import WireGroup
 from sim_backend.wired import Port
 
 
-def build_emulator(config: Config, transmit: Transmit, *, is_lockstep: bool) -> Emulator:
+def build_emulator(
+    config: Config, transmit: Transmit | Sequence[Transmit], *, is_lockstep: bool
+) -> Emulator:
     """Return the arm of `config.plant` behind one emulated amplifier per entry of `config.axes`.
 
     Args:
         config: Plant, motors, and the axes whose families and identifiers are to be emulated.
-        transmit: Puts a frame on the wire.
+        transmit: Puts a frame on the wire; of several buses one each, in their order.
         is_lockstep: What the amplifiers tell the master about their time, and how time begins.
 
     Raises:
         SimError: If the plant cannot be built as configured.
     """
     servos = [Servo(settings) for settings in config.servos]
-    faults = Faults(config.emulator.faults, servos, [transmit] * len(servos))
+    transmits = (transmit,) if callable(transmit) else transmit
+    places = [axis.bus - 1 for axis in config.axes]
+    outputs = [transmits[place] for place in places]
+    faults = Faults(config.emulator.faults, servos, outputs, places)
     nodes = [
         _NODES[axis.family](axis, servo, faults.output(j), is_lockstep=is_lockstep)
         for j, (axis, servo) in enumerate(zip(config.axes, servos, strict=True))
     ]
-    return Emulator(Arm(config.plant), servos, nodes, is_lockstep=is_lockstep, faults=faults)
+    arm = Arm(config.plant)
+    return Emulator(arm, servos, nodes, is_lockstep=is_lockstep, faults=faults, places=places)
 
 
 def build_wired_emulator(config: Config, ports: Sequence[Port]) -> Emulator:
@@ -72,22 +79,51 @@ def open_emulation(config: Config, settings: EmulatorSettings) -> tuple[Wire, Em
         SimError: If the bus cannot be opened, the plant cannot be built, or the wire model is
             asked for where it cannot be.
     """
-    wire: Wire
     if settings.wire.is_on:
-        wire = _open_timed_hub(config, settings)
+        wires: list[Wire] = [_open_timed_hub(config, settings)]
     else:
-        wire = open_wire(config.bus.address)
+        wires = _open_wires(config.bus.addresses)
+    wire = wires[0]
     try:
         if isinstance(wire, TimedHub):
             return wire, build_wired_emulator(config, wire.ports(config.joints))
         is_lockstep = settings.time == "lockstep"
-        return wire, build_emulator(config, wire.transmit, is_lockstep=is_lockstep)
+        transmits = [each.transmit for each in wires]
+        emulator = build_emulator(config, transmits, is_lockstep=is_lockstep)
+        return (wire if len(wires) == 1 else WireGroup(wires, config.bus.addresses)), emulator
     except BaseException:
-        wire.close()
+        for each in wires:
+            each.close()
         raise
 
 
+def _open_wires(addresses: Sequence[str]) -> list[Wire]:
+    wires: list[Wire] = []
+    try:
+        for address in addresses:
+            wires.append(open_wire(address))  # noqa: PERF401 - those that are open may have to be closed
+    except BaseException:
+        for wire in wires:
+            wire.close()
+        raise
+    return wires
+
+
+def require_one_bus(config: Config) -> None:
+    """Refuse the wire model for an arm on several buses.
+
+    Raises:
+        SimError: If it is on several.
+    """
+    if config.bus.more:
+        raise SimError(
+            f"emulator.wire.is_on: the wire model is of one bus, this arm is on "
+            f"{len(config.bus.addresses)}; switch it off, or put all axes on bus 1"
+        )
+
+
 def _open_timed_hub(config: Config, settings: EmulatorSettings) -> TimedHub:
+    require_one_bus(config)
     scheme, path = split_address(config.bus.address)
     if scheme != "unix":
         raise SimError(

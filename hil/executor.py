@@ -50,6 +50,8 @@ class Executor:
             "end": self._end,
             "supervisor_lost": self._lose_supervisor,
             "gateway_lost": self._lose_gateway,
+            "authority": lambda _: None,  # who has it, for the record
+            "operator_lost": self._lose_operator,
         }
 
     def execute(self, command: Mapping[str, Any]) -> None:
@@ -109,12 +111,23 @@ class Executor:
         self.is_ending = True
 
     def _lose_gateway(self, command: Mapping[str, Any]) -> None:
+        self._control.trip(FaultCode.GATEWAY_LOST)
+        self._follow_policy(command["policy"])
+
+    def _lose_operator(self, command: Mapping[str, Any]) -> None:
+        policy = command["policy"]
+        if policy != "finish":
+            self._drop_pending("the operator was lost")
+        if policy == "stop" and not self._control.machine.state.is_powered:
+            self._control.disable()  # it may be about to be
+        self._follow_policy(policy)
+
+    def _follow_policy(self, policy: str) -> None:
         control = self._control
-        control.trip(FaultCode.GATEWAY_LOST)
         state = control.machine.state
-        if command["policy"] == "hold" and state is State.ACTIVE:
+        if policy == "hold" and state is State.ACTIVE:
             control.stop()
-        elif command["policy"] == "stop" and state.is_powered:
+        elif policy == "stop" and state.is_powered:
             control.disable()
 
     def _drop_pending(self, reason: str) -> None:

@@ -8,12 +8,15 @@ from controller.machine import State
 from controller.reference import MotionLimits, MotionState
 from hil.config import Config
 from hil.fixed_protobuf import Records
-from hil.messages import KellyRequest, TrajectoryRequest
+from hil.messages import KellyRequest, SinusoidRequest, TrajectoryRequest
 from hil.planner import plan
 from hil.scenarios import Scenario
 from hil.simulation import Simulation, SimulationError, Sink, open_recording
 from hil.telemetry import SampleLayout
 
+SCENARIO_JOINTS = 2
+"""The reference scenarios are of arms with so many joints."""
+SWING_S, SWING_RAD, SWING_HZ = 10.0, 0.3, 0.25
 SETTLE_CYCLES = 100
 """Cycles recorded after the end of the trajectory."""
 STOP_MARGIN_CYCLES = 100
@@ -41,6 +44,18 @@ def scenario_settings(scenario: Scenario) -> dict[str, Any]:
         "controller": {"law": {"adaptation": scenario.adaptation}, "velocity": velocity},
         "emulator": {"is_ideal": is_ideal},
     }
+
+
+def swing(config: Config) -> TrajectoryRequest:
+    """Return a slow sinusoid of all joints about the start pose, for arms of any size."""
+    n = config.joints
+    return SinusoidRequest(
+        duration_s=SWING_S,
+        center_rad=config.plant.q0_rad,
+        amplitude_rad=(SWING_RAD,) * n,
+        frequency_Hz=(SWING_HZ,) * n,
+        ramp_s=1.0,
+    )
 
 
 class Memory:

@@ -6,6 +6,8 @@ Every check takes the configuration and, for tests, the directory that stands fo
 import os
 import platform
 import resource
+import sys
+import sysconfig
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +16,29 @@ from hil.finding import Finding, Level
 
 _ROOT = Path("/")
 _FAST_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "")
+
+
+def is_optimised_build() -> bool:
+    """Tell whether this Python was compiled with the help of a profile (PGO).
+
+    Distributions do so by means of their own, which the build's options do not show.
+    """
+    options = str(sysconfig.get_config_var("CONFIG_ARGS") or "")
+    return "--enable-optimizations" in options or sys.base_prefix == "/usr"
+
+
+def interpreter(config: Config) -> Finding:
+    """Judge how Python was built: the loop's own work is the interpreter's."""
+    del config
+    name = f"{platform.python_implementation()} {platform.python_version()}"
+    if is_optimised_build():
+        return Finding("python", "pass", name)
+    return Finding(
+        "python",
+        "warn",
+        f"{name}, built without profile-guided optimisation",
+        "use the distribution's Python, or build one with --enable-optimizations --with-lto",
+    )
 
 
 def kernel(config: Config, root: Path = _ROOT) -> Finding:
@@ -182,6 +207,7 @@ def clock(config: Config, root: Path = _ROOT) -> Finding:
 
 
 HOST_CHECKS: tuple[Callable[[Config], Finding], ...] = (
+    interpreter,
     kernel,
     scheduler,
     throttling,

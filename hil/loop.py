@@ -6,15 +6,14 @@ import platform
 import signal
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from time import thread_time_ns
 from typing import Any
 
 from controller.machine import Trigger
-from drivers.arm_bus import ArmBus
+from drivers.arm_group import ArmGroup, ArmLike, configure_arm, make_arm, open_buses
 from drivers.axis import AxisInfo
-from drivers.bus import open_bus
 from drivers.errors import BusError, DriverError
-from drivers.registry import heartbeat_cycles, make_axes
 from hil.config import Config
 from hil.control import Control
 from hil.errors import HilError
@@ -46,7 +45,7 @@ class Loop:
     def __init__(
         self,
         shared: SharedMemory,
-        bus: ArmBus,
+        bus: ArmLike,
         infos: list[AxisInfo],
         start_up: Sequence[LoggedFrame] = (),
     ) -> None:
@@ -85,7 +84,7 @@ class Loop:
         self._frames: list[bytes] = []
         self._record_bytes = self._room = shared.frames.payload_size
         for t_ns, direction, frame in start_up:
-            self._append_entry(self._entry(t_ns, direction, frame))
+            self._log_frame(direction, frame, t_ns)
 
     def run(self, granted: Granted) -> None:
         """Run cycles until a signal ends the loop and torque is off.
@@ -189,6 +188,7 @@ class Loop:
                 "late_frames": bus.late_frames,
                 "unknown_frames": bus.unknown_frames,
                 "error_frames": bus.error_frames,
+                **({"buses": bus.counts()} if isinstance(bus, ArmGroup) else {}),
                 "scheduler": self._granted.scheduler,
                 "memory_locked": self._granted.memory_locked,
                 "realtime_missing": list(self._granted.missing),
@@ -227,10 +227,9 @@ class Loop:
             {"id": command["id"], "verb": command["verb"], "ok": not reason, "reason": reason},
         )
 
-    def _log_frame(self, direction: int, frame: bytes) -> None:
-        self._append_entry(self._entry(now_ns(), direction, frame))
-
-    def _append_entry(self, entry: bytes) -> None:
+    def _log_frame(self, direction: int, frame: bytes, t_ns: int = 0) -> None:
+        """Keep a frame for the ring; without an instant of its own it was seen just now."""
+        entry = self._entry(t_ns or now_ns(), direction, frame)
         self._room -= len(entry)
         if self._room < 0:
             self._flush_frames()
@@ -249,8 +248,8 @@ class Loop:
 
 def open_arm(
     config: Config, start_up: list[LoggedFrame] | None = None
-) -> tuple[ArmBus, list[AxisInfo]]:
-    """Join the bus and set up every amplifier, disabled.
+) -> tuple[ArmLike, list[AxisInfo]]:
+    """Join the bus, or all buses, and set up every amplifier, disabled.
 
     Args:
         config: Bus and axes.
@@ -260,14 +259,14 @@ def open_arm(
         DriverError: If the bus or an amplifier is not there or not as configured.
     """
     period_s = config.loop.period_s
-    raw = open_bus(config.bus.address)
-    wire = SpinningBus(raw) if config.loop.spin else raw
-    bus = ArmBus(wire, make_axes(config.axes, period_s=period_s), now_ns=now_ns)
+    wires = open_buses(config.bus.addresses)
+    if config.loop.spin:
+        wires = [SpinningBus(wire) for wire in wires]
+    bus = make_arm(wires, config.axes, period_s=period_s, now_ns=now_ns)
     if start_up is not None:
         bus.log_frames(lambda way, frame: start_up.append(LoggedFrame(now_ns(), way, frame)))
     try:
-        cycles = heartbeat_cycles(config.axes, period_s=period_s)
-        return bus, bus.configure(heartbeat_cycles=cycles)
+        return bus, configure_arm(bus, config.axes, period_s=period_s)
     except BaseException:
         bus.close()
         raise
@@ -299,14 +298,13 @@ def main(shared_fd: int, parent_pid: int) -> int:
     return 0
 
 
-def _last_word(bus: ArmBus) -> None:
+def _last_word(bus: ArmLike) -> None:
     """Whatever ended the loop: tell every amplifier to take torque off, then leave the bus."""
-    try:
-        for axis in bus.axes:
-            axis.disable()
+    for axis in bus.axes:
+        axis.disable()
+    with suppress(BusError):  # the amplifiers' watchdogs act
         bus.request_feedback()
-        bus.send_torques([0.0] * len(bus.axes))
+        with suppress(BusError):  # one bus of several; the others have got theirs
+            bus.send_torques([0.0] * len(bus.axes))
         bus.request_feedback()
-    except BusError:
-        pass  # the amplifiers' watchdogs act
     bus.close()

@@ -5,6 +5,7 @@ suits the arm (joints, limits, state) is decided later; here only its form is.
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal, Self, TypeAlias, Union
 
@@ -25,7 +26,11 @@ MAX_JOINTS: Final = 16
 MAX_WAYPOINTS: Final = 10_000
 MAX_SAMPLES: Final = 600_000
 MAX_DURATION_S: Final = 3600.0
-MAX_PAYLOAD_BYTES: Final = 64 << 20
+MAX_TRAJECTORY_BYTES: Final = 8 << 20
+MAX_COMMAND_BYTES: Final = 16 << 10
+"""Longer payloads are refused unread: reading one holds up everything else in the process."""
+PROTOCOL_VERSION: Final = 1
+"""Changes when a client of an older one would be misunderstood; new optional fields do not."""
 _MAX_REASON: Final = 300
 
 Real = Annotated[float, Strict()]
@@ -36,6 +41,13 @@ Points = Annotated[list[Joints], Field(min_length=2, max_length=MAX_WAYPOINTS), 
 Samples = Annotated[list[Joints], Field(min_length=5, max_length=MAX_SAMPLES), FailFast()]
 Duration = Annotated[Real, Field(gt=0, le=MAX_DURATION_S)]
 Text = Annotated[str, Field(max_length=64)]
+OperatorName = Annotated[
+    str, Field(max_length=64, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.@-]*$", strict=True)
+]
+"""One chunk of a Zenoh key: the operator's liveliness token is `hil/<arm>/operator/<name>`."""
+Nanoseconds = Annotated[int, Field(ge=0, lt=1 << 63, strict=True)]
+Code = Literal["held", "no_authority", "stale", "repeated_id", "busy"]
+"""Why a request was not even looked at; see `Reply.code`."""
 
 
 class RequestError(HilError):
@@ -47,30 +59,60 @@ class _Message(BaseModel):
 
 
 class _Request(_Message):
-    request_id: Text | None = Field(None, description="any text; the reply carries it")
+    version: Literal[1] = Field(1, description="of these messages")
+    request_id: Text | None = Field(
+        None, description="new for every request; sent again, it gets the first answer again"
+    )
 
 
-class EnableRequest(_Request):
+class _Order(_Request):
+    """A request that takes authority; `request_id` is required."""
+
+    lease: Text | None = Field(None, description="required: as `acquire` has answered it")
+    sent_ns: Nanoseconds | None = Field(
+        None,
+        description="required: when it was sent, by the daemon's clock: the `t_ns` that `acquire` "
+        "has answered and the time since",
+    )
+
+
+class AcquireRequest(_Request):
+    """Take authority over the arm; refused while another operator holds it."""
+
+    operator: OperatorName = Field(
+        description="unique to the session; it has declared the liveliness token `operator/NAME`"
+    )
+
+
+class ReleaseRequest(_Order):
+    """Give authority back. The arm goes on with what it does."""
+
+
+class EnableRequest(_Order):
     """Enable the amplifiers; the reference starts at the measured pose."""
 
 
-class DisableRequest(_Request):
+class DisableRequest(_Order):
     """Come to a damped stop, then disable the amplifiers."""
 
 
-class StopRequest(_Request):
+class StopRequest(_Order):
     """Slow down along the running trajectory and hold."""
 
 
-class EstopRequest(_Request):
-    """Take torque off at once; latched until a reset."""
+class EstopRequest(_Message):
+    """Take torque off at once; latched until a reset. Takes no authority and is never too old."""
+
+    version: int = Field(PROTOCOL_VERSION, description="any: a stop is a stop")
+    request_id: Text | None = Field(None, description="any text; the reply carries it")
+    operator: OperatorName | None = Field(None, description="who asks, for the record")
 
 
-class ResetRequest(_Request):
+class ResetRequest(_Order):
     """Clear a latched fault or emergency stop."""
 
 
-class _Motion(_Request):
+class _Motion(_Order):
     approach: Literal["blend", "none"] = Field(
         "blend",
         description="blend: first move from the present reference to the start of the trajectory; "
@@ -125,7 +167,7 @@ class SamplesRequest(_Motion):
     q_rad: Samples = Field(description="one list of joint angles per sample")
 
 
-class MoveRequest(_Request):
+class MoveRequest(_Order):
     """The fastest jerk-limited move from the present reference to a pose, at rest there."""
 
     kind: Literal["move"] = "move"
@@ -148,7 +190,7 @@ TrajectoryRequest: TypeAlias = Annotated[
 ]
 
 
-class GainBoundsRequest(_Request):
+class GainBoundsRequest(_Order):
     """Move the bounds of the self-tuned gain, Nm s/rad; the ceilings are the configuration's."""
 
     Kd_min: Joints
@@ -164,7 +206,7 @@ class GainBoundsRequest(_Request):
         return self
 
 
-class FaultRequest(_Request):
+class FaultRequest(_Order):
     """Inject a fault into the emulator, or clear it with `ok`."""
 
     target: Literal["encoder", "amplifier", "bus", "host"]
@@ -186,11 +228,11 @@ class FaultRequest(_Request):
         return self
 
 
-Request: TypeAlias = (
-    EnableRequest
+Order: TypeAlias = (
+    ReleaseRequest
+    | EnableRequest
     | DisableRequest
     | StopRequest
-    | EstopRequest
     | ResetRequest
     | WaypointsRequest
     | ExponentialSineRequest
@@ -201,6 +243,8 @@ Request: TypeAlias = (
     | GainBoundsRequest
     | FaultRequest
 )
+"""Takes authority."""
+Request: TypeAlias = Order | AcquireRequest | EstopRequest
 
 
 class Reply(_Message):
@@ -220,10 +264,22 @@ class Reply(_Message):
     duration_s: float | None = Field(
         None, description="of an accepted trajectory, approach and final braking included"
     )
+    cycle: int | None = Field(None, description="of the loop, in which it had taken effect")
+    code: Code | None = Field(
+        None,
+        description="of a refusal that has nothing to do with the arm: held by another; "
+        "no_authority: not or no longer yours; stale: too old; repeated_id: used for another "
+        "request; busy: too many requests at once",
+    )
+    holder: str | None = Field(None, description="of a refusal for lack of authority: who has it")
+    lease: str | None = Field(None, description="of `acquire`: goes into every request")
+    t_ns: int | None = Field(None, description="of `acquire`: the daemon's clock")
 
 
 COMMANDS: Final[Mapping[str, TypeAdapter[Any]]] = MappingProxyType(
     {
+        "acquire": TypeAdapter(AcquireRequest),
+        "release": TypeAdapter(ReleaseRequest),
         "enable": TypeAdapter(EnableRequest),
         "disable": TypeAdapter(DisableRequest),
         "stop": TypeAdapter(StopRequest),
@@ -246,13 +302,23 @@ def parse(command: str, payload: bytes | str) -> Request:
     adapter = COMMANDS.get(command)
     if adapter is None:
         raise RequestError(f"command {command[:64]!r} is unknown; known: {', '.join(COMMANDS)}")
-    if len(payload) > MAX_PAYLOAD_BYTES:
-        raise RequestError(f"payload of {len(payload)} bytes is beyond {MAX_PAYLOAD_BYTES} bytes")
+    check_size(command, len(payload))
     try:
         request: Request = adapter.validate_json(payload or b"{}")
     except ValidationError as error:
         raise RequestError(f"{command}: {explain(error)}") from error
     return request
+
+
+def check_size(command: str, size: int) -> None:
+    """Refuse a payload of so many bytes if it is too long for `cmd/<command>`.
+
+    Raises:
+        RequestError: With the limit.
+    """
+    most = MAX_TRAJECTORY_BYTES if command == "trajectory" else MAX_COMMAND_BYTES
+    if size > most:
+        raise RequestError(f"{command[:64]}: payload of {size} bytes is beyond {most} bytes")
 
 
 def parse_trajectory(payload: bytes | str) -> TrajectoryRequest:
@@ -281,6 +347,12 @@ def schemas() -> dict[str, dict[str, Any]]:
     """Return the JSON Schema of every command's request, and of `reply`."""
     known = {name: adapter.json_schema() for name, adapter in COMMANDS.items()}
     return known | {"reply": Reply.model_json_schema()}
+
+
+def contract() -> dict[str, Any]:
+    """Return what `schema` answers: the version, all JSON Schemas, and telemetry's `.proto`."""
+    proto = (Path(__file__).parent / "proto" / "telemetry.proto").read_text(encoding="utf-8")
+    return {"version": PROTOCOL_VERSION, **schemas(), "proto": proto}
 
 
 def _got(given: object) -> str:

@@ -18,6 +18,7 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
 from drivers.arm_bus import MARK
+from drivers.arm_group import split_bus
 from hil.fixed_protobuf import Records
 from hil.proto import telemetry_pb2
 from hil.recording_writer import CONFIG_NAME, Part, RecordingError, RecordingWriter
@@ -146,7 +147,7 @@ class Recording:
                 if seen_ns is not None and frame.t_ns <= seen_ns:
                     continue
                 last_ns = frame.t_ns
-                if with_marks or frame.direction != MARK:
+                if with_marks or split_bus(frame.direction)[1] != MARK:
                     yield frame
             seen_ns = last_ns
 

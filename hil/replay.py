@@ -8,17 +8,18 @@ configuration.
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from controller.machine import Trigger
-from drivers.arm_bus import MARK, RECEIVED, SENT, ArmBus
+from drivers.arm_bus import MARK, RECEIVED, SENT
+from drivers.arm_group import configure_arm, make_arm, split_bus
 from drivers.bus import Bus
 from drivers.errors import DriverError
-from drivers.registry import heartbeat_cycles, make_axes
 from hil.config import Config
 from hil.control import Control
 from hil.errors import HilError
@@ -77,73 +78,101 @@ class _DivergedError(Exception):
     """The replay sends where the recording receives: nothing can be compared any more."""
 
 
-class _RecordedBus(Bus):
-    """A bus on which a recording happens again.
+class _Course:
+    """How far a replay has come, on all buses together.
 
     Attributes:
         until_ns: Recorded instant up to which received frames belong to the present cycle; None
             during start-up, when the time-outs decide.
         clock_ns: Recorded time.
+        cycle: The present one.
+        sent: Frames sent.
+        equal: Of these, as recorded.
+        difference: The first one in a frame.
     """
 
-    carries_fd = True
-
-    def __init__(self, frames: Iterable[LoggedFrame]) -> None:
-        super().__init__()
-        self._frames = iter(frames)
-        self._next = next(self._frames, None)
-        self.clock_ns = self._next.t_ns if self._next is not None else 0
+    def __init__(self) -> None:
         self.until_ns: int | None = None
+        self.clock_ns = 0
         self.cycle = -1
         self.sent = self.equal = 0
         self.difference: Difference | None = None
-
-    def send(self, frame: bytes) -> bool:
-        recorded = self._next
-        if recorded is None:
-            raise _FramesOverError
-        if recorded.direction != SENT:
-            self.note("a frame sent", "none", frame.hex())
-            raise _DivergedError
-        self._advance(recorded)
-        self.sent += 1
-        if recorded.frame == frame:
-            self.equal += 1
-        else:
-            self.note(f"frame {self.sent}", recorded.frame.hex(), frame.hex())
-        return True
-
-    def recv(self, timeout_s: float) -> bytes | None:
-        until_ns = self.until_ns
-        if until_ns is None:
-            until_ns = self.clock_ns + round(timeout_s * 1e9)
-        frame = self._next
-        if frame is None or frame.direction != RECEIVED or frame.t_ns > until_ns:
-            if self.until_ns is None:
-                self.clock_ns = until_ns
-            return None
-        self._advance(frame)
-        return frame.frame
-
-    def pass_mark(self, direction: int, _frame: bytes) -> None:
-        """Frame log of the replayed bus: its cycle has begun, and so has the recorded one."""
-        if direction == MARK and self._next is not None and self._next.direction == MARK:
-            self._advance(self._next)
-
-    def end_cycle(self, next_ns: int) -> None:
-        """Note a frame that the recording sent before the next cycle, and the replay did not."""
-        recorded = self._next
-        if recorded is not None and recorded.direction == SENT and recorded.t_ns < next_ns:
-            self.note("a frame sent", recorded.frame.hex(), "none")
-            raise _DivergedError
 
     def note(self, what: str, recorded: str, replayed: str) -> None:
         """Keep a difference if it is the first."""
         if self.difference is None:
             self.difference = Difference(self.cycle, what, recorded, replayed)
 
+
+class _RecordedBus(Bus):
+    """A bus on which a recording happens again.
+
+    Args:
+        frames: What was logged on this bus, `direction` being `RECEIVED`, `SENT` or `MARK`.
+        course: Shared by all buses of the arm.
+    """
+
+    carries_fd = True
+
+    def __init__(self, frames: Iterable[LoggedFrame], course: _Course) -> None:
+        super().__init__()
+        self._frames = iter(frames)
+        self._course = course
+        self._next = next(self._frames, None)
+
+    def send(self, frame: bytes) -> bool:
+        course = self._course
+        if course.until_ns is None:
+            self._pass_overdue()
+        recorded = self._next
+        if recorded is None:
+            raise _FramesOverError
+        if recorded.direction != SENT:
+            course.note("a frame sent", "none", frame.hex())
+            raise _DivergedError
+        self._advance(recorded)
+        course.sent += 1
+        if recorded.frame == frame:
+            course.equal += 1
+        else:
+            course.note(f"frame {course.sent}", recorded.frame.hex(), frame.hex())
+        return True
+
+    def recv(self, timeout_s: float) -> bytes | None:
+        course = self._course
+        until_ns = course.until_ns
+        if until_ns is None:
+            until_ns = course.clock_ns + round(timeout_s * 1e9)
+        frame = self._next
+        if frame is None or frame.direction != RECEIVED or frame.t_ns > until_ns:
+            if course.until_ns is None:
+                course.clock_ns = until_ns
+            return None
+        self._advance(frame)
+        return frame.frame
+
+    def _pass_overdue(self) -> None:
+        """Start-up: pass what a wait took after its time was up, because it woke too late.
+
+        Nobody waited for it, or the wait would have ended with it.
+        """
+        while self._next is not None and self._next.direction == RECEIVED:
+            self._advance(self._next)
+
+    def pass_mark(self) -> None:
+        """Be told that the replayed cycle has begun, as the recorded one has."""
+        if self._next is not None and self._next.direction == MARK:
+            self._advance(self._next)
+
+    def end_cycle(self, next_ns: int) -> None:
+        """Note a frame that the recording sent before the next cycle, and the replay did not."""
+        recorded = self._next
+        if recorded is not None and recorded.direction == SENT and recorded.t_ns < next_ns:
+            self._course.note("a frame sent", recorded.frame.hex(), "none")
+            raise _DivergedError
+
     def _advance(self, frame: LoggedFrame) -> None:
-        self.clock_ns = max(self.clock_ns, frame.t_ns)
+        self._course.clock_ns = max(self._course.clock_ns, frame.t_ns)
         self._next = next(self._frames, None)
 
     def fileno(self) -> int:
@@ -178,7 +207,8 @@ class Replayer:
         self._config = config
         self._trajectories = recording.trajectories()
         self._slots: dict[int, memoryview[float]] = {}
-        self._bus = _RecordedBus(recording.frames(with_marks=True))
+        self._course = _Course()
+        self._buses = _recorded_buses(recording, len(config.bus.addresses), self._course)
         self._inputs = _inputs_by_cycle(recording.events)
         self._layout = SampleLayout(config.joints, with_truth=False)
         self._replayed: list[bytes] = []
@@ -193,31 +223,32 @@ class Replayer:
             self._start()
             self._run_cycles()
         except DriverError as error:
-            self._bus.note("start-up", "amplifiers configured", str(error))
+            self._course.note("start-up", "amplifiers configured", str(error))
         except (_FramesOverError, _DivergedError):
             pass
-        bus = self._bus
-        found = [d for d in (bus.difference, self._sample_difference()) if d is not None]
+        course = self._course
+        found = [d for d in (course.difference, self._sample_difference()) if d is not None]
         first = min(found, key=lambda difference: difference.cycle, default=None)
-        return Replay(len(self._replayed), bus.sent, bus.equal, first)
+        return Replay(len(self._replayed), course.sent, course.equal, first)
 
     def _start(self) -> None:
-        config, bus = self._config, self._bus
+        config, course = self._config, self._course
         period_s = config.loop.period_s
-        axes = make_axes(config.axes, period_s=period_s)
-        self._arm = ArmBus(bus, axes, now_ns=lambda: bus.clock_ns)
-        cycles = heartbeat_cycles(config.axes, period_s=period_s)
-        self._is_lockstep = self._arm.configure(heartbeat_cycles=cycles)[0].is_lockstep
-        self._control = Control(
-            config, self._arm, now_ns=lambda: bus.clock_ns, events=lambda *_: None
-        )
+
+        def now_ns() -> int:
+            return course.clock_ns
+
+        self._arm = make_arm(self._buses, config.axes, period_s=period_s, now_ns=now_ns)
+        infos = configure_arm(self._arm, config.axes, period_s=period_s)
+        self._is_lockstep = infos[0].is_lockstep
+        self._control = Control(config, self._arm, now_ns=now_ns, events=lambda *_: None)
         self._executor = Executor(self._control, self._slots.__getitem__, lambda *_: None)
         self._sampler = Sampler(self._layout, self._control, self._arm)
-        self._arm.log_frames(bus.pass_mark)
+        self._arm.log_frames(self._pass_mark)
         self._control.fire(Trigger.BUS_READY)
 
     def _run_cycles(self) -> None:
-        bus, columns = self._bus, self._recording.samples
+        course, columns = self._course, self._recording.samples
         before = -1
         starts_ns = columns["t_ns"].tolist()
         rows = zip(
@@ -228,18 +259,25 @@ class Replayer:
             strict=True,
         )
         for cycle, start_ns, feedback_ns, next_ns in rows:
-            bus.cycle = cycle
-            bus.until_ns = start_ns + feedback_ns
+            course.cycle = cycle
+            course.until_ns = until_ns = start_ns + feedback_ns
             self._take_inputs(cycle, is_after_step=False)
             periods = 1 if self._is_lockstep else cycle - before
             self._executor.begin_cycle(periods)
-            self._control.step(bus.until_ns, periods)
+            self._control.step(until_ns, periods)
             buffer = bytearray(self._layout.size)
             self._sampler.write(buffer, 0, (cycle, start_ns, 0), Stamps())
             self._replayed.append(bytes(buffer))
             self._take_inputs(cycle, is_after_step=True)
-            bus.end_cycle(next_ns)
+            for bus in self._buses:
+                bus.end_cycle(next_ns)
             before = cycle
+
+    def _pass_mark(self, direction: int, _frame: bytes) -> None:
+        """Frame log of the replayed arm."""
+        number, way = split_bus(direction)
+        if way == MARK:
+            self._buses[number - 1].pass_mark()
 
     def _take_inputs(self, cycle: int, *, is_after_step: bool) -> None:
         for command in self._inputs.get((cycle, is_after_step), ()):
@@ -257,6 +295,38 @@ class Replayer:
             return None
         replayed = self._layout.decode(self._replayed)
         return first_difference(self._recording.samples[: len(replayed)], replayed)
+
+
+def _recorded_buses(recording: Recording, count: int, course: _Course) -> list[_RecordedBus]:
+    """Return the buses of a recording, each with what was logged on it.
+
+    Frames are read as they are needed: the buses of a cycle are never far apart in the file.
+    """
+    source = recording.frames(with_marks=True)
+    waiting: list[deque[LoggedFrame]] = [deque() for _ in range(count)]
+
+    def of_bus(place: int) -> Iterator[LoggedFrame]:
+        mine = waiting[place]
+        while True:
+            while not mine:
+                logged = next(source, None)
+                if logged is None:
+                    return
+                number, way = split_bus(logged.direction)
+                if number > count:
+                    raise _foreign(recording, number, count)
+                waiting[number - 1].append(logged._replace(direction=way))
+            yield mine.popleft()
+
+    course.clock_ns = next(recording.frames(with_marks=True)).t_ns
+    return [_RecordedBus(of_bus(place), course) for place in range(count)]
+
+
+def _foreign(recording: Recording, number: int, count: int) -> ReplayError:
+    return ReplayError(
+        f"{recording.path} has frames of bus {number}, the configuration has {count}; replay it "
+        "with its own buses"
+    )
 
 
 def _refuse_black_box(recording: Recording) -> None:

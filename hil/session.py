@@ -14,6 +14,11 @@ from hil.errors import HilError
 CONNECT_TIMEOUT_MS = 3000
 RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
 """How often a lost connection is tried anew: a restarted gateway is back within a second or two."""
+LINK_LEASE_MS: Final = 5000
+"""A client that shows no life for so long is gone, and its authority with it."""
+QUEUE_BATCHES: Final = 16
+"""Of 64 kB each: what a subscriber may be behind, beyond the system's own buffers."""
+WAIT_BEFORE_DROP_US: Final = 5000
 FILE_SUFFIX: Final = ".json5"
 FILE_KEYS: Final = (
     *(
@@ -63,7 +68,11 @@ def make_config(settings: ZenohSettings) -> zenoh.Config:
         "connect/exit_on_failure": True,
         "connect/retry": RETRY,
         "scouting/multicast/enabled": settings.multicast_scouting,
+        "transport/link/tx/queue/size/data": QUEUE_BATCHES,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
     }
+    if settings.mode == "client":
+        values["transport/link/tx/lease"] = LINK_LEASE_MS
     if settings.connect or not settings.file:
         values["connect/endpoints"] = list(settings.connect)
     try:

@@ -1,6 +1,6 @@
 """Shared memory between the loop and the processes around it: lock-free, one writer per part.
 
-One memory file (memfd) holds the configuration, six rings, the trajectory slots, the histograms of
+One memory file (memfd) holds the configuration, the rings, the trajectory slots, the histograms of
 the loop's timing and a few counters. Nobody ever waits for anybody: a writer that laps a reader is
 noticed by the reader as lost records. The file has no name, so that nothing is left behind however
 the processes end.
@@ -29,6 +29,8 @@ _TAIL_WORDS = 1  # sequence number + 1
 _CONFIG_SIZE = 64 << 10
 _EVENT_BYTES = 2048
 _STATUS_BYTES = 8192
+_LEASE_BYTES = 512
+_ANSWER_BYTES = 1024
 _CLOCK_MONOTONIC = 1
 _CHILDREN = ("loop", "gateway", "recorder")
 STATUS_EVERY_S: Final = 0.1
@@ -36,7 +38,7 @@ STATUS_EVERY_S: Final = 0.1
 RING_S: Final = 13.0
 """How far back the samples and bus frames reach: the black box's 12 s, and time to take them."""
 FRAMES_AT_ONCE: Final = 16
-"""Bus frames in one record, at most; fewer if they are CAN FD frames that nobody announced."""
+"""Bus frames in one record, at least; fewer if they are CAN FD frames that nobody announced."""
 SLOTS: Final = 3
 """Trajectory slots: one being played, one waiting, one being written."""
 
@@ -194,6 +196,8 @@ class SharedMemory:
         events: Ring of JSON events, written by the loop.
         commands: Ring of JSON commands, written by the gateway.
         notes: Ring of JSON events about the recording, written by the recorder.
+        lease: Ring of who has authority, as JSON, written by the gateway for its successor.
+        answers: Ring of the answers given, written by the gateway for its successor.
         timing: Histograms of the loop's stamps and its deadline misses, written by the loop.
         layout: Layout of a sample.
         frame_layout: Layout of a bus frame.
@@ -213,6 +217,8 @@ class SharedMemory:
         self.events = self._ring("events")
         self.commands = self._ring("commands")
         self.notes = self._ring("notes")
+        self.lease = self._ring("lease")
+        self.answers = self._ring("answers")
         self._status = self._ring("status")
         self.timing = Timing(
             self._view("timing"),
@@ -306,6 +312,21 @@ class SharedMemory:
         return self._memory[start : start + size]
 
 
+def frames_at_once(config: Config) -> int:
+    """Return how many bus frames fit in one record: more than an arm's cycle has, of any size.
+
+    On top of what comes in every cycle there is room for one frame per axis that comes now and
+    then, and two per bus (SYNC or mark, the master's heartbeat).
+    """
+    period_s = config.loop.period_s
+    cyclic = sum(
+        frame.every == 1 and not frame.is_shared
+        for axis in config.axes
+        for frame in axis.cycle_frames(period_s)
+    )
+    return max(FRAMES_AT_ONCE, cyclic + config.joints + 2 * len(config.bus.addresses))
+
+
 def _plan(
     config: Config, sample_size: int, frame_layout: BusFrameLayout
 ) -> dict[str, tuple[int, ...]]:
@@ -317,11 +338,13 @@ def _plan(
     cycles = round(RING_S / period_s)
     rings = {
         "samples": (sample_size, cycles),
-        "frames": (frame_size * FRAMES_AT_ONCE, cycles),
+        "frames": (frame_size * frames_at_once(config), cycles),
         "events": (_EVENT_BYTES, 512),
         "commands": (_EVENT_BYTES, 64),
         "notes": (_EVENT_BYTES, 64),
         "status": (_STATUS_BYTES, 4),
+        "lease": (_LEASE_BYTES, 4),
+        "answers": (_ANSWER_BYTES, 2048),
     }
     words = ["estop", "loop.commands", *(f"{who}.beat" for who in _CHILDREN)]
     words += [f"{who}.{part}" for who in ("gateway", "recorder") for part in ("samples", "events")]

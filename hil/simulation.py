@@ -10,12 +10,11 @@ from zlib import crc32
 
 from controller.machine import State, Trigger
 from controller.reference import Reference
-from drivers.arm_bus import ArmBus
+from drivers.arm_group import ArmLike, configure_arm, make_arm
 from drivers.buses.loopback import LoopbackBus
-from drivers.registry import heartbeat_cycles, make_axes
 from hil.config import Config
 from hil.control import ArmLink, Control
-from hil.emulation import build_emulator, build_wired_emulator
+from hil.emulation import build_emulator, build_wired_emulator, require_one_bus
 from hil.errors import HilError
 from hil.executor import Executor
 from hil.ideal import IdealArm
@@ -97,21 +96,24 @@ class Simulation:
         self.control.fire(Trigger.BUS_READY)
         self._is_starting = False
 
-    def _build(self) -> tuple[Emulator, ArmBus]:
-        """The emulated robot and the drivers in front of it, joined by an in-process bus."""
-        config, loopback = self.config, LoopbackBus()
+    def _build(self) -> tuple[Emulator, ArmLike]:
+        """The emulated robot and the drivers in front of it, joined by in-process buses."""
+        config = self.config
+        buses = [LoopbackBus() for _ in config.bus.addresses]
         if config.emulator.wire.is_on:
-            emulator = self._build_wired(loopback)
+            require_one_bus(config)
+            emulator = self._build_wired(buses[0])
         else:
-            emulator = self._emulator = build_emulator(config, loopback.deliver, is_lockstep=True)
-            loopback.connect(emulator.receive, self._wait)
-        axes = make_axes(config.axes, period_s=config.loop.period_s)
-        bus = ArmBus(loopback, axes, now_ns=lambda: self._clock_ns)
+            transmits = [bus.deliver for bus in buses]
+            emulator = self._emulator = build_emulator(config, transmits, is_lockstep=True)
+            for number, loopback in enumerate(buses):
+                loopback.connect(_receiver(emulator, number), self._wait)
+        period_s = config.loop.period_s
+        bus = make_arm(buses, config.axes, period_s=period_s, now_ns=lambda: self._clock_ns)
         if self._sink is not None:
             bus.log_frames(self._log_frame)
         emulator.power_on()
-        period_s = config.loop.period_s
-        bus.configure(heartbeat_cycles=heartbeat_cycles(config.axes, period_s=period_s))
+        configure_arm(bus, config.axes, period_s=period_s)
         if self.wire is not None:
             start_ns = -(-self._clock_ns // WIRED_START_NS) * WIRED_START_NS
             self._clock_ns = self.wire.advance(start_ns)
@@ -261,6 +263,11 @@ class Simulation:
     def close(self) -> None:
         """Record what is left; the recording itself stays open."""
         self._flush_frames()
+
+
+def _receiver(emulator: Emulator, bus: int) -> Callable[[bytes], None]:
+    """Return what takes the master's frames on a bus (from 0)."""
+    return emulator.receive if bus == 0 else lambda frame: emulator.receive(frame, bus)
 
 
 def open_recording(config: Config, path: Path) -> RecordingWriter:

@@ -3,15 +3,20 @@
 A sample may be published twice (by a gateway that is killed, and again by its successor), but
 none is left out: the place in the ring moves on only when what was read has been sent. `t_ns`
 and `seq` tell the second copy from the first.
+
+Nobody waits for a subscriber: every link has a queue of its own, of some seconds of samples, and
+what does not fit in it is lost to that subscriber alone, who sees it by `seq`.
 """
 
 import json
 from collections import deque
 from time import monotonic, sleep
+from typing import Any
 
 import numpy as np
 import zenoh
 
+from hil.authority import Authority
 from hil.shared import STATUS_EVERY_S, SharedMemory
 
 STREAM_EVERY_S = 0.01
@@ -19,6 +24,8 @@ BATCH_SAMPLES = 1000
 EVENTS_AT_ONCE = 100
 WINDOW_S = 10.0
 """Lateness and busy time in `status` are over this many seconds."""
+_JSON = zenoh.Encoding.APPLICATION_JSON
+_DROP, _BLOCK = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
 RETURN_S = 0.5
 """A successor goes on this long after the first subscriber is back: for the others."""
 
@@ -28,10 +35,15 @@ class Streams:
 
     A gateway that succeeds a killed one holds samples and events back until a subscriber has
     reconnected, or until half of the ring is full.
+
+    Attributes:
+        last: The status published last.
     """
 
-    def __init__(self, shared: SharedMemory, session: zenoh.Session) -> None:
+    def __init__(self, shared: SharedMemory, session: zenoh.Session, authority: Authority) -> None:
         self._shared = shared
+        self._authority = authority
+        self.last: dict[str, Any] = shared.status()
         self._session = session
         self._samples = shared.reader("samples", "gateway")
         self._events = shared.reader("events", "gateway")
@@ -39,32 +51,25 @@ class Streams:
         window = round(WINDOW_S / shared.config.loop.period_s)
         self._late_ns: deque[int] = deque(maxlen=window)
         self._busy_ns: deque[int] = deque(maxlen=window)
-        reliable = zenoh.CongestionControl.BLOCK
         self._telemetry = self._publisher(
-            "telemetry", zenoh.Encoding.APPLICATION_PROTOBUF, reliable
+            "telemetry", zenoh.Encoding.APPLICATION_PROTOBUF, congestion_control=_DROP
         )
-        self._event = self._publisher("event", zenoh.Encoding.APPLICATION_JSON, reliable)
-        self._status = self._publisher(
-            "status", zenoh.Encoding.APPLICATION_JSON, zenoh.CongestionControl.DROP
-        )
+        self._status = self._publisher("status", _JSON, congestion_control=_DROP)
+        own = zenoh.Priority.INTERACTIVE_HIGH  # few: they have a queue of their own in every link
+        self._event = self._publisher("event", _JSON, congestion_control=_BLOCK, priority=own)
         self._is_holding = self._samples.place > 0
         self._subscribed_s: float | None = None
         self._listener = self._telemetry.declare_matching_listener(self._note_matching)
 
-    def _publisher(
-        self, name: str, encoding: zenoh.Encoding, congestion: zenoh.CongestionControl
-    ) -> zenoh.Publisher:
-        return self._session.declare_publisher(
-            f"hil/{self._shared.config.arm.name}/{name}",
-            encoding=encoding,
-            congestion_control=congestion,
-        )
+    def _publisher(self, name: str, encoding: zenoh.Encoding, **quality: Any) -> zenoh.Publisher:  # noqa: ANN401
+        key = f"hil/{self._shared.config.arm.name}/{name}"
+        return self._session.declare_publisher(key, encoding=encoding, **quality)
 
     def _note_matching(self, status: zenoh.MatchingStatus) -> None:
         self._subscribed_s = monotonic() if status.matching else None
 
     def turn(self) -> None:
-        """Publish what is new. Blocks while a subscriber does not keep up, for some seconds."""
+        """Publish what is new. Samples for a subscriber whose queue is full are dropped for it."""
         self._samples.commit()  # what was put a turn ago has left this process
         self._events.commit()
         self._notes.commit()
@@ -103,11 +108,13 @@ class Streams:
     def publish_status(self) -> None:
         """Publish the loop's last status with what the gateway knows."""
         status = self._shared.status()
+        status["operator"] = self._authority.holder
         status["telemetry_published"] = self._samples.place - self._samples.lost
         status["telemetry_lost"] = self._samples.lost
         status["wake_late_us"] = _quantiles_us(self._late_ns)
         status["busy_us"] = _quantiles_us(self._busy_ns)
         status["timing"] = self._shared.timing.summary()
+        self.last = status
         self._status.put(json.dumps(status))
 
 

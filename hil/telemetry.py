@@ -216,12 +216,13 @@ class BusFrameLayout:
         self._first_time = struct.Struct(f"<{before_time}xq").unpack_from
 
     def _entry(self) -> FrameEntry:
-        pack, pack_fd = _frame_packer(self._classic), _frame_packer(self._fd)
+        pack, head, way, data = _frame_packer(self._classic)
+        pack_fd, head_fd, way_fd, data_fd = _frame_packer(self._fd)
 
         def entry(t_ns: int, direction: int, frame: bytes) -> bytes:
             if len(frame) == FRAME_SIZE:
-                return pack(t_ns, direction, frame)
-            return pack_fd(t_ns, direction, frame)
+                return pack(head, t_ns, way, direction, data, frame)
+            return pack_fd(head_fd, t_ns, way_fd, direction, data_fd, frame)
 
         return entry
 
@@ -255,9 +256,10 @@ def _frame_messages(frame_size: int) -> FixedMessages:
     )
 
 
-def _frame_packer(messages: FixedMessages) -> FrameEntry:
+def _frame_packer(messages: FixedMessages) -> tuple[Callable[..., bytes], bytes, bytes, bytes]:
+    """Return what packs (head, t_ns, way, direction, data, frame), and its three constants."""
     at, way, data = (field.constant for field in messages.fields)
     head = messages.prefix + at
     frame_size = messages.fields[2].count
-    pack = struct.Struct(f"<{len(head)}sq{len(way)}sI{len(data)}s{frame_size}s").pack
-    return lambda t_ns, direction, frame: pack(head, t_ns, way, direction, data, frame)
+    layout = struct.Struct(f"<{len(head)}sq{len(way)}sI{len(data)}s{frame_size}s")
+    return layout.pack, head, way, data

@@ -61,8 +61,7 @@ class Timing:
     """
 
     __slots__ = (
-        "_add_busy", "_add_feedback", "_add_late", "_add_law", "_add_sent", "_counters",
-        "_half_ns", "_is_overdue", "_law_ns", "_period_ns", "histograms",
+        "_counters", "_half_ns", "_is_overdue", "_law_ns", "_period_ns", "_words", "histograms",
     )  # fmt: skip
 
     def __init__(self, memory: memoryview, *, period_s: float, timeout_s: float) -> None:
@@ -72,8 +71,7 @@ class Timing:
         for name in TIMES:
             self.histograms[name] = Histogram(memory[start : start + 8 * WORDS])
             start += 8 * WORDS
-        adds = [histogram.add for histogram in self.histograms.values()]
-        self._add_late, self._add_feedback, self._add_law, self._add_sent, self._add_busy = adds
+        self._words = memory[8 * _COUNTERS :].cast("Q")
         self._period_ns, self._half_ns, self._law_ns = _limits_ns(period_s, timeout_s)
         self._is_overdue = False
 
@@ -85,21 +83,17 @@ class Timing:
             is_fresh: All feedback was there in time.
             skipped: Periods left out just before it.
         """
-        late_ns, feedback_ns, law_ns, sent_ns, busy_ns = stamps
-        self._add_late(late_ns)
-        self._add_feedback(feedback_ns)
-        self._add_law(law_ns)
-        self._add_sent(sent_ns)
-        self._add_busy(busy_ns)
+        Histogram.add_each(self._words, stamps)
         counters = self._counters
         counters[_CYCLES] += 1
-        was_overdue, self._is_overdue = self._is_overdue, sent_ns > self._period_ns
+        is_overdue = stamps.sent_ns > self._period_ns
+        was_overdue, self._is_overdue = self._is_overdue, is_overdue
         if skipped:
             counters[_SKIPPED] += skipped
             if not was_overdue:
                 counters[_CAUSES + Cause.LATE_WAKE_UP] += 1
                 return
-        if not is_fresh or sent_ns > self._period_ns:
+        if is_overdue or not is_fresh:
             counters[_CAUSES + self._cause(stamps, is_fresh)] += 1
 
     def _cause(self, stamps: Stamps, is_fresh: bool) -> Cause:

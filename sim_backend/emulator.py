@@ -2,7 +2,8 @@
 
 Every 500 us each current loop runs and the arm advances under its mean torques; every second
 time the nodes' timers tick. In lockstep a SYNC, once all nodes have latched and answered it,
-advances everything by one period; otherwise the caller passes the wall's time on.
+advances everything by one period; otherwise the caller passes the wall's time on. An arm on several
+buses takes a SYNC from each of them for one period.
 """
 
 from collections.abc import Sequence
@@ -19,6 +20,8 @@ from sim_backend.settings import FaultSettings
 
 SYNC_ID = 0x080
 TICK_S = 1e-3
+TICKS_AHEAD_MAX = 8
+"""A bus without SYNC holds up emulated time no longer than this, in periods."""
 _NOT_DATA = RTR_FLAG | ERR_FLAG
 
 
@@ -35,6 +38,7 @@ class Emulator:
         is_lockstep: SYNC advances time. May be changed at any instant.
         faults: Through which the nodes send (`Faults.output`); left out, there are no faults on
             the frames that they send. Needs one node per joint, shoulder first.
+        places: Bus (from 0) of each node, in the order of `nodes`; left out, all are on one.
 
     Attributes:
         is_lockstep: See above.
@@ -53,12 +57,16 @@ class Emulator:
         "_faults",
         "_fd_nodes",
         "_first_half_Nm",
+        "_has_period_begun",
         "_is_waiting",
         "_nodes",
+        "_nodes_on",
+        "_places",
         "_remainder_ns",
         "_remote_nodes",
         "_sense",
         "_servos",
+        "_ticks",
         "dq_true_rad_s",
         "is_lockstep",
         "q_true_rad",
@@ -73,6 +81,7 @@ class Emulator:
         *,
         is_lockstep: bool,
         faults: Faults | None = None,
+        places: Sequence[int] = (),
     ) -> None:
         count = len(arm.q_rad)
         if len(servos) != count or len(nodes) != count:
@@ -84,8 +93,17 @@ class Emulator:
         self._cyclic_nodes = [
             n for n in nodes if type(n).begin_period is not AmplifierNode.begin_period
         ]
-        self._fd_nodes = [n for n in nodes if n.takes_fd]
-        self._remote_nodes = [n for n in nodes if n.takes_remote_requests]
+        self._places = tuple(places) or (0,) * count
+        self._nodes_on = [
+            [n for n, place in zip(nodes, self._places, strict=True) if place == bus]
+            for bus in range(max(self._places) + 1)
+        ]
+        self._fd_nodes = [[n for n in on_bus if n.takes_fd] for on_bus in self._nodes_on]
+        self._remote_nodes = [
+            [n for n in on_bus if n.takes_remote_requests] for on_bus in self._nodes_on
+        ]
+        self._ticks = [0] * len(self._nodes_on)
+        self._has_period_begun = False
         self.is_lockstep = is_lockstep
         self._faults = faults or Faults(FaultSettings(), servos, [_lose] * count)
         self._faults.connect(nodes, self._reach_nodes)
@@ -116,52 +134,74 @@ class Emulator:
         for node in self._nodes:
             node.power_on()
 
-    def receive(self, frame: bytes) -> None:
+    def receive(self, frame: bytes, bus: int = 0) -> None:
         """Take one frame from the wire.
 
         Error reports are ignored; CAN FD frames and remote requests are for the nodes that take
-        them. In lockstep a SYNC advances one period after the nodes have answered it.
+        them. In lockstep a SYNC advances one period after the nodes have answered it; with several
+        buses, the SYNC that completes the period on all of them.
 
         Args:
             frame: Record of either size (`drivers.frame`).
+            bus: The bus it came on, from 0.
 
         Raises:
             PlantError: If the arm broke down while advancing.
         """
         if not self._faults.is_quiet:
-            self._receive_through_faults(frame)
+            self._receive_through_faults(frame, bus)
             return
         if len(frame) != FRAME_SIZE:
             if is_fd(frame):
-                self._receive_fd(frame)
+                self._receive_fd(frame, bus)
             return
         can_id, data = unpack_frame(frame)
         if can_id & _NOT_DATA:
-            self._receive_remote(can_id, data)
+            self._receive_remote(can_id, data, bus)
             return
         if can_id == FAULT_ID:
             self._take_fault(data)
             return
         if can_id != SYNC_ID and can_id != LOCKSTEP_ID:  # noqa: PLR1714 - every frame
-            for node in self._nodes:
+            for node in self._nodes_on[bus]:
                 node.receive(can_id, data)
             return
         self._latch_truth()
-        for node in self._nodes:
+        for node in self._nodes_on[bus]:
             node.receive(can_id, data)
-        if self.is_lockstep:
+        if self.is_lockstep and self._take_tick(bus):
             self._begin_period()
             self.advance_period()
 
-    def _receive_remote(self, can_id: int, data: bytes) -> None:
+    def leave_lockstep(self) -> None:
+        """Let time run by the clock; a SYNC that waited for those of other buses is forgotten."""
+        self.is_lockstep = self._has_period_begun = False
+        self._ticks = [0] * len(self._ticks)
+
+    def _take_tick(self, bus: int) -> bool:
+        """Count a SYNC in lockstep; True if time is to go on, one period for one of every bus.
+
+        Buses are read in any order, so that one may be ahead. One that stays behind has lost a
+        SYNC, or its master: it is waited for `TICKS_AHEAD_MAX` periods in all, not in each.
+        """
+        ticks = self._ticks
+        if len(ticks) == 1:
+            return True
+        ticks[bus] += 1
+        if not all(ticks) and ticks[bus] <= TICKS_AHEAD_MAX:
+            return False
+        self._ticks = [max(0, count - 1) for count in ticks]
+        return True
+
+    def _receive_remote(self, can_id: int, data: bytes, bus: int) -> None:
         if not can_id & ERR_FLAG:
-            for node in self._remote_nodes:
+            for node in self._remote_nodes[bus]:
                 node.receive(can_id, data)
 
-    def _receive_fd(self, frame: bytes) -> None:
+    def _receive_fd(self, frame: bytes, bus: int) -> None:
         can_id, data = unpack_frame(frame)
         if not can_id & _NOT_DATA:
-            for node in self._fd_nodes:
+            for node in self._fd_nodes[bus]:
                 node.receive(can_id, data)
 
     # --- faults -------------------------------------------------------------------------------
@@ -171,7 +211,7 @@ class Emulator:
         if order is not None:
             self._faults.take(order, self._period)
 
-    def _receive_through_faults(self, frame: bytes) -> None:
+    def _receive_through_faults(self, frame: bytes, bus: int) -> None:
         """Do as `receive` does, while a fault acts: time goes on even if nobody hears its tick."""
         can_id, data = unpack_frame(frame)
         if can_id == FAULT_ID:
@@ -180,21 +220,24 @@ class Emulator:
         is_tick = can_id in (SYNC_ID, LOCKSTEP_ID)
         if is_tick:
             self._latch_truth()
-            if self.is_lockstep:
+            if self.is_lockstep and not self._has_period_begun:
+                self._has_period_begun = True
                 self._faults.begin_period(is_lockstep=True)
-        self._faults.send_from_host(frame)
-        if is_tick and self.is_lockstep:
+        self._faults.send_from_host(frame, bus)
+        if is_tick and self.is_lockstep and self._take_tick(bus):
             self._begin_period()
             self.advance_period()
 
-    def _reach_nodes(self, frame: bytes) -> None:
-        """Hand a frame that has come through to the nodes that take such, and are not deaf."""
+    def _reach_nodes(self, bus: int, frame: bytes) -> None:
+        """Hand a frame that has come through to the bus's nodes that take such, and hear."""
         can_id, data = unpack_frame(frame)
         if can_id & ERR_FLAG:
             return
         for joint, node in enumerate(self._nodes):
-            is_for_it = (node.takes_fd or not is_fd(frame)) and (
-                node.takes_remote_requests or not can_id & RTR_FLAG
+            is_for_it = (
+                self._places[joint] == bus
+                and (node.takes_fd or not is_fd(frame))
+                and (node.takes_remote_requests or not can_id & RTR_FLAG)
             )
             if is_for_it and not self._faults.is_deaf(joint):
                 node.receive(can_id, data)
@@ -212,6 +255,7 @@ class Emulator:
         Raises:
             PlantError: If the arm broke down.
         """
+        self._has_period_begun = False
         self._run_current_loop()
         self._run_current_loop()
 

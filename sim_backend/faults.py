@@ -14,7 +14,8 @@ Garbage on the bus has 29-bit identifiers, which hardly anybody listens to: the 
 no frame pass that is merely disturbed. A power stage keeps its last torque while its amplifier
 hangs, until the amplifier's own watchdog acts. A bridge, or a process, that hangs keeps frames back
 and lets them go in one burst at the end. An echo is the same frame a second time, one period later.
-`bus` acts in both directions, `host` on what the host sends. Faults of one target replace each
+`bus` acts in both directions, and on all buses alike if there are several; `host` on what the
+host sends. Faults of one target replace each
 other; those of different targets add up.
 
 Time is emulated time in periods of 1 ms, random values come from a seeded generator: the same run
@@ -45,7 +46,7 @@ _ON_LINE = {
 }
 """Fault of an amplifier -> that of the line on which its frames leave it."""
 Carry = Callable[[int, bytes], None]
-"""Takes a frame and the amplifier (from 0) that sent it; of the host's frames it is 0."""
+"""Takes a frame and the amplifier (from 0) that sent it; of the host's frames, the bus (from 0)."""
 
 
 class Line:
@@ -218,6 +219,7 @@ class Faults:
         settings: Sizes, seed and schedule.
         servos: One per joint, shoulder first.
         transmits: How frames of each joint's amplifier get onto the wire.
+        places: Bus (from 0) of each joint's amplifier; left out, all are on one.
 
     Attributes:
         is_quiet: Nothing acts: frames, torques and encoders need not come by here.
@@ -225,7 +227,11 @@ class Faults:
     """
 
     def __init__(
-        self, settings: FaultSettings, servos: Sequence[Servo], transmits: Sequence[Transmit]
+        self,
+        settings: FaultSettings,
+        servos: Sequence[Servo],
+        transmits: Sequence[Transmit],
+        places: Sequence[int] = (),
     ) -> None:
         self.is_quiet = True
         self.is_idle = True
@@ -233,31 +239,35 @@ class Faults:
         self._servos = tuple(servos)
         self._transmits = tuple(transmits)
         self._nodes: tuple[AmplifierNode, ...] = ()
-        self._deliver: Transmit = _nowhere
+        self._deliver: Carry = _nowhere
         random = Random(settings.seed)  # noqa: S311 - to disturb, not to hide
         joints = range(len(servos))
+        self._places = tuple(places) or (0,) * len(servos)
+        buses = range(max(self._places) + 1)
         self._encoders = [_Encoder(settings, random) for _ in joints]
         self._stages = [_PowerStage(settings) for _ in joints]
         self._deaf = [False] * len(servos)
-        self._from_bus = Line(self._reach_host, random)
+        self._from_buses = [Line(self._reach_host, random) for _ in buses]
         self._from_amplifiers = [Line(self._enter_bus, random, keeps_id=True) for _ in joints]
-        self._to_bus = Line(lambda _, frame: self._deliver(frame), random)
+        self._to_buses = [Line(self._reach_amplifiers, random) for _ in buses]
         self._from_host = Line(
-            lambda source, frame: self._to_bus.carry(source, frame, self._period), random
+            lambda bus, frame: self._to_buses[bus].carry(bus, frame, self._period), random
         )
-        self._lines = (self._from_bus, *self._from_amplifiers, self._to_bus, self._from_host)
+        self._lines = (
+            *self._from_buses, *self._from_amplifiers, *self._to_buses, self._from_host
+        )  # fmt: skip
         self._active: dict[tuple[FaultTarget, int], _Active] = {}
         self._schedule = sorted(settings.schedule, key=lambda entry: entry.start_s)
         self._is_timed = False
         self._period = 0
         self._start = 0
 
-    def connect(self, nodes: Sequence[AmplifierNode], deliver: Transmit) -> None:
+    def connect(self, nodes: Sequence[AmplifierNode], deliver: Carry) -> None:
         """Join the amplifiers, one per joint in the servos' order.
 
         Args:
             nodes: The amplifiers themselves.
-            deliver: Hands a frame that has come through to those who hear (`is_deaf`).
+            deliver: Hands a frame that has come through to those on its bus who hear (`is_deaf`).
         """
         self._nodes = tuple(nodes)
         self._deliver = deliver
@@ -317,8 +327,8 @@ class Faults:
             if kind is FaultKind.OFF:
                 self._nodes[place].fail_power_stage()
         elif target is FaultTarget.BUS:
-            self._to_bus.set(kind)
-            self._from_bus.set(kind)
+            for line in (*self._to_buses, *self._from_buses):
+                line.set(kind)
         else:
             self._from_host.set(kind)
 
@@ -340,7 +350,8 @@ class Faults:
             elif target is FaultTarget.AMPLIFIER:
                 self._deaf[place] = self._from_amplifiers[place].is_interrupted = is_off
             elif target is FaultTarget.BUS:
-                self._to_bus.is_interrupted = self._from_bus.is_interrupted = is_off
+                for line in (*self._to_buses, *self._from_buses):
+                    line.is_interrupted = is_off
             else:
                 self._from_host.is_interrupted = is_off
 
@@ -370,9 +381,9 @@ class Faults:
 
     # --- what goes through here while a fault acts ----------------------------------------------
 
-    def send_from_host(self, frame: bytes) -> None:
-        """Put a frame of the host on its way to the amplifiers."""
-        self._from_host.carry(0, frame, self._period)
+    def send_from_host(self, frame: bytes, bus: int = 0) -> None:
+        """Put a frame of the host on its way to the amplifiers on a bus (from 0)."""
+        self._from_host.carry(bus, frame, self._period)
 
     def is_deaf(self, joint: int) -> bool:
         """Tell whether an amplifier (from 0) hears nothing."""
@@ -388,11 +399,14 @@ class Faults:
             encoder.distort(servo)
 
     def _enter_bus(self, joint: int, frame: bytes) -> None:
-        self._from_bus.carry(joint, frame, self._period)
+        self._from_buses[self._places[joint]].carry(joint, frame, self._period)
+
+    def _reach_amplifiers(self, bus: int, frame: bytes) -> None:
+        self._deliver(bus, frame)
 
     def _reach_host(self, joint: int, frame: bytes) -> None:
         self._transmits[joint](frame)
 
 
-def _nowhere(_frame: bytes) -> None:
+def _nowhere(_bus: int, _frame: bytes) -> None:
     """Take frames of a robot whose amplifiers are not there yet."""

@@ -9,7 +9,7 @@ import os
 import select
 import socket
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +34,8 @@ class Wire(ABC):
 
     address = ""
     """Where to join, if that is not the address which the wire was opened with."""
+    bus = 0
+    """The bus (from 0) on which the frames that `wait` returned last have come."""
 
     @abstractmethod
     def transmit(self, frame: bytes) -> None:
@@ -56,6 +58,10 @@ class Wire(ABC):
         Raises:
             SimError: If the wire is gone.
         """
+
+    def filenos(self) -> Sequence[int]:
+        """Descriptors one of which is readable when `wait` has something to do; none if unknown."""
+        return ()
 
     @abstractmethod
     def close(self) -> None:
@@ -125,6 +131,11 @@ class BusWire(Wire):
         except BusError as error:
             raise SimError(str(error)) from error
         return frames
+
+    def filenos(self) -> Sequence[int]:
+        """See `Wire.filenos`."""
+        number = self._bus.fileno()
+        return (number,) if number >= 0 else ()
 
     def close(self) -> None:
         """Close the bus."""
@@ -215,6 +226,10 @@ class UnixHub(Wire):
             timeout_s = deadline_s - monotonic()
             if frames or timeout_s <= 0.0:
                 return frames
+
+    def filenos(self) -> Sequence[int]:
+        """See `Wire.filenos`."""
+        return self._readable
 
     def _collect(self, ready: list[int]) -> list[bytes]:
         frames: list[bytes] = []

@@ -1,7 +1,9 @@
 """Arms that come with the product, and amplifiers that fit them.
 
 `bench` and `light` are synthetic; `pelican` is the arm of Kelly, Santibanez and Loria, "Control
-of Robot Manipulators in Joint Space", ch. 5, with friction and torque limits assumed.
+of Robot Manipulators in Joint Space", ch. 5, with friction and torque limits assumed. `chain_h:N`
+is a synthetic arm of N joints for questions of scale: each link is lighter than the one before by
+the same factor, so that joints far out neither vanish nor rule the shoulder.
 """
 
 from collections.abc import Sequence
@@ -25,11 +27,25 @@ _TORQUE_MAX_NM = {"bench": (15.0, 8.0), "pelican": (25.0, 5.0), "light": (8.0, 4
 _GRAVITY = {"": 0.0, "_h": 0.0, "_v": GRAVITY_M_S2}
 
 PRESETS = tuple(arm + plane for arm in _LINKS for plane in _GRAVITY)
-"""Every preset name: the arm, then `_h` (horizontal, as without suffix) or `_v` (vertical)."""
+"""Every preset of two joints: arm, then `_h` (horizontal, as without suffix) or `_v` (vertical)."""
+
+CHAIN = "chain_h:"
+"""Prefix of the presets with any number of joints; the number follows."""
+CHAIN_JOINTS_MAX = 12
+CHAIN_TAPER = 0.6
+"""Every mass, inertia, friction and torque of a chain's link over that of the link before."""
+_CHAIN_SHOULDER = LinkSettings(
+    length_m=0.08, com_m=0.02, mass_kg=1.0, inertia_kg_m2=0.1, viscous_Nms_rad=0.05, coulomb_Nm=0.05
+)
+_CHAIN_TORQUE_MAX_NM = 20.0
+_CHAIN_POSE_RAD = (0.3, -0.2)
+_TAPERED = ("mass_kg", "inertia_kg_m2", "viscous_Nms_rad", "coulomb_Nm")
 
 
-def plant_preset(name: str, q0_rad: Sequence[float] = (0.0, 0.0)) -> PlantSettings:
-    """Return the arm called `name`, at rest at `q0_rad` (default: hanging straight down).
+def plant_preset(name: str, q0_rad: Sequence[float] | None = None) -> PlantSettings:
+    """Return the arm called `name`, at rest at `q0_rad`.
+
+    Left out, that is hanging straight down, and for a chain slightly bent to and fro.
 
     Raises:
         SimError: If there is no such preset; the message lists those there are.
@@ -38,9 +54,13 @@ def plant_preset(name: str, q0_rad: Sequence[float] = (0.0, 0.0)) -> PlantSettin
         >>> plant_preset("pelican_v").gravity_m_s2
         9.81
     """
+    if is_chain(name):
+        return _chain_plant(chain_joints(name), q0_rad)
     arm, plane = _split(name)
     links = tuple(LinkSettings(**dict(zip(_FIELDS, row, strict=True))) for row in _LINKS[arm])
-    return PlantSettings(links=links, gravity_m_s2=_GRAVITY[plane], q0_rad=tuple(q0_rad))
+    return PlantSettings(
+        links=links, gravity_m_s2=_GRAVITY[plane], q0_rad=tuple(q0_rad or (0.0, 0.0))
+    )
 
 
 def servo_preset(name: str) -> tuple[ServoSettings, ...]:
@@ -49,18 +69,56 @@ def servo_preset(name: str) -> tuple[ServoSettings, ...]:
     Raises:
         SimError: If there is no such preset; the message lists those there are.
     """
-    arm, _ = _split(name)
+    if is_chain(name):
+        joints = range(chain_joints(name))
+        peaks_Nm = tuple(round(_CHAIN_TORQUE_MAX_NM * CHAIN_TAPER**j, 3) for j in joints)
+    else:
+        peaks_Nm = _TORQUE_MAX_NM[_split(name)[0]]
     return tuple(
         ServoSettings(
             torque_constant_Nm_A=torque_max_Nm / CURRENT_PEAK_A, current_max_A=CURRENT_PEAK_A
         )
-        for torque_max_Nm in _TORQUE_MAX_NM[arm]
+        for torque_max_Nm in peaks_Nm
     )
+
+
+def is_chain(name: str) -> bool:
+    """Tell whether a preset's name asks for a chain."""
+    return name.startswith(CHAIN)
+
+
+def chain_joints(name: str) -> int:
+    """Return how many joints the chain called `name` has.
+
+    Raises:
+        SimError: If that is no number from 1 to `CHAIN_JOINTS_MAX`.
+    """
+    number = name.removeprefix(CHAIN)
+    is_number = number.isascii() and number.isdigit()
+    if not is_number or not 1 <= int(number) <= CHAIN_JOINTS_MAX:
+        raise SimError(
+            f"arm preset {name!r}: a chain has 1 to {CHAIN_JOINTS_MAX} joints, e.g. {CHAIN}7"
+        )
+    return int(number)
+
+
+def _chain_plant(joints: int, q0_rad: Sequence[float] | None) -> PlantSettings:
+    first = _CHAIN_SHOULDER
+    links = tuple(
+        first.model_copy(
+            update={key: getattr(first, key) * CHAIN_TAPER**number for key in _TAPERED}
+        )
+        for number in range(joints)
+    )
+    pose = tuple(q0_rad or (_CHAIN_POSE_RAD[number % 2] for number in range(joints)))
+    return PlantSettings(links=links, q0_rad=pose)
 
 
 def _split(name: str) -> tuple[str, str]:
     """Split a preset's name into (arm, suffix)."""
     if name not in PRESETS:
-        raise SimError(f"no arm preset {name!r}; there are: {', '.join(PRESETS)}")
+        raise SimError(
+            f"no arm preset {name!r}; there are: {', '.join(PRESETS)}, and {CHAIN}N with N joints"
+        )
     arm, underscore, plane = name.partition("_")
     return arm, underscore + plane

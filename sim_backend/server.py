@@ -18,9 +18,10 @@ _TICKS = ((SYNC_ID, 0), (LOCKSTEP_ID, 0))
 class EmulatorServer:
     """Runs an emulator on a wire.
 
-    In lockstep the plant advances one period per SYNC, however long the master takes; without any
-    SYNC for `stall_timeout_s` (a master that is not there yet, or died) time runs by the clock,
-    so that the amplifiers' watchdogs act. By the clock, it always does.
+    In lockstep the plant advances one period per SYNC (of an arm on several buses, when it has come
+    on each), however long the master takes; without any SYNC for `stall_timeout_s` (a master that
+    is not there yet, or died) time runs by the clock, so that the amplifiers' watchdogs act. By the
+    clock, it always does.
     """
 
     def __init__(
@@ -39,7 +40,7 @@ class EmulatorServer:
         self._now_ns = now_ns
         self._advanced_ns = now_ns()
         self._sync_ns = self._advanced_ns - self._stall_ns
-        emulator.is_lockstep = False
+        emulator.leave_lockstep()
 
     def run(self, is_ended: Callable[[], bool]) -> None:
         """Serve until `is_ended` says so; it is asked at least every 50 ms.
@@ -53,14 +54,14 @@ class EmulatorServer:
 
     def serve(self, timeout_s: float) -> None:
         """Handle the frames at hand, waiting `timeout_s` at most, and pass time on."""
-        frames = self._wire.wait(timeout_s)
+        frames, bus = self._wire.wait(timeout_s), self._wire.bus
         if not self._emulator.is_lockstep:
             self._advance_by_clock()
         for frame in frames:
             self.frames += 1
             if unpack_header(frame) in _TICKS:
                 self._take_sync()
-            self._emulator.receive(frame)
+            self._emulator.receive(frame, bus)
         if self._emulator.is_lockstep:  # also if others than the master talk on
             self._leave_stalled_lockstep()
 
@@ -71,7 +72,7 @@ class EmulatorServer:
     def _leave_stalled_lockstep(self) -> None:
         now_ns = self._now_ns()
         if now_ns - self._sync_ns > self._stall_ns:
-            self._emulator.is_lockstep = False
+            self._emulator.leave_lockstep()
             self._advanced_ns = now_ns
 
     def _advance_by_clock(self) -> None:

@@ -123,26 +123,24 @@ class Servo:
             target_Nm, newest_Nm = self._delayed_Nm[0], target_Nm
             self._delayed_Nm.append(newest_Nm)  # pushes the oldest out
         demand_A = target_Nm / self._torque_constant_Nm_A
-        limited_A = _clip(demand_A, self._current_max_A)
+        limit_A, limit_V = self._current_max_A, self._supply_V
+        limited_A = demand_A if -limit_A <= demand_A <= limit_A else _clip(demand_A, limit_A)
         before_A = self.current_A
         error_A = limited_A - before_A
         wanted_V = self._gain * error_A + self._integral_V
-        voltage_V = _clip(wanted_V, self._supply_V)
+        voltage_V = wanted_V if -limit_V <= wanted_V <= limit_V else _clip(wanted_V, limit_V)
         if voltage_V == wanted_V:  # the integral waits while the supply limits
             self._integral_V += self._integral_gain * error_A
         self.is_saturated = voltage_V != wanted_V or limited_A != demand_A
-        settled_A = (
-            voltage_V - self._torque_constant_Nm_A * self.motor_rad_s
-        ) / self._resistance_ohm
+        torque_constant_Nm_A = self._torque_constant_Nm_A
+        settled_A = (voltage_V - torque_constant_Nm_A * self.motor_rad_s) / self._resistance_ohm
         self.current_A = settled_A + (before_A - settled_A) * self._decay
         mean_A = settled_A + (before_A - settled_A) * self._mean_weight
-        return mean_A * self._torque_constant_Nm_A
+        return mean_A * torque_constant_Nm_A
 
 
 def _clip(value: float, limit: float) -> float:
-    """Limit to +-`limit`; NaN becomes 0."""
-    if -limit <= value <= limit:
-        return value
+    """Limit a value that is not within +-`limit`; NaN becomes 0."""
     if value > limit:
         return limit
     return -limit if value < -limit else 0.0

@@ -19,9 +19,15 @@ RESET_CYCLES = 10
 """Cycles for which the fault-reset edge is held."""
 HEARTBEATS_BEFORE_BOOT_UP = 8
 """Heartbeats that may still arrive between a reset and the boot-up message."""
+DEAF_CYCLES = 3
+"""Commands to remove power after which a drive that was enabled and says nothing is stopped."""
+STOP_EVERY = 50
+"""Commands between two such stops, while the drive goes on saying nothing."""
 RESTING_TORQUE = 0
 TORQUE_OBJECT_MAX = 0x7FFF
 """Largest per mille that 6071 and 6077 hold."""
+ROUNDING = 1.0 + 1e-12
+"""A limit that is a whole number of per mille stays one, in spite of binary fractions."""
 _POWER_UP = {  # towards power: drive state -> controlword
     Cia402State.SWITCH_ON_DISABLED: codec.CONTROL_SHUTDOWN,
     Cia402State.READY_TO_SWITCH_ON: codec.CONTROL_SWITCH_ON,
@@ -47,8 +53,9 @@ class Cia402Axis(Axis):
         self._master_id = master_id
         node = settings.node_id
         self._command_head = pack_frame(codec.COB_RPDO1 + node, bytes(4))[:8]
-        self._per_mille_per_Nm = settings.direction * 1000.0 / settings.rated_torque_Nm
-        self._torque_max = round(1000.0 * settings.torque_max_Nm / settings.rated_torque_Nm)
+        rated_Nm = round(settings.rated_torque_Nm * 1e3) / 1e3 or 1e-3  # as 6076 has it, in mNm
+        self._per_mille_per_Nm = settings.direction * 1000.0 / rated_Nm
+        self._torque_max = math.floor(1000.0 * settings.torque_max_Nm / rated_Nm * ROUNDING)
         self._rad_per_count = settings.direction * math.tau / settings.counts_per_turn
         self._range_counts = 0
         self._position: int | None = None
@@ -59,6 +66,8 @@ class Cia402Axis(Axis):
         self._controlword = codec.CONTROL_DISABLE_VOLTAGE
         self._wants_power = False
         self._reset_cycles = 0
+        self._deaf_cycles = 0
+        self._is_stopped = False
         self._heartbeat_limit = math.ceil(3e-3 * settings.heartbeat_ms / period_s)
         self._heartbeat_age = 0
 
@@ -202,19 +211,40 @@ class Cia402Axis(Axis):
         """RPDO1: controlword, and torque when the drive is enabled and is to stay so."""
         torque = RESTING_TORQUE
         if self._reset_cycles:
+            if self._is_stopped:
+                self._is_stopped = False
+                return self._nmt_frame(codec.NmtCommand.START)
             self._step_reset()
         elif self.status is AxisStatus.ENABLED and self._wants_power:
             wanted = round(tau_Nm * self._per_mille_per_Nm)
             torque = max(-self._torque_max, min(self._torque_max, wanted))
+        elif self.status is AxisStatus.ENABLED and self.age_cycles > 0 and self._is_deaf():
+            return self._nmt_frame(codec.NmtCommand.ENTER_PRE_OPERATIONAL)
         return self._command_head + codec.RPDO1.pack(self._controlword, torque) + b"\0\0\0\0"
+
+    def _is_deaf(self) -> bool:
+        """Count a command to remove power that nothing shows the effect of; True if to be stopped.
+
+        Without SYNC an RPDO has no effect, not even one that ends torque, while every RPDO that
+        arrives keeps the drive's own deadline (1400:05) from acting. Leaving OPERATIONAL needs no
+        SYNC, and ends torque by 6007.
+        """
+        self._deaf_cycles += 1
+        is_due = self._deaf_cycles % STOP_EVERY == DEAF_CYCLES
+        self._is_stopped = self._is_stopped or is_due
+        return is_due
+
+    def _nmt_frame(self, command: codec.NmtCommand) -> bytes:
+        return pack_frame(codec.COB_NMT, codec.pack_nmt(command, self._settings.node_id))
 
     def enable(self) -> None:
         """Ask for power: 06, 07, 0F as the drive's state allows."""
         self._wants_power = True
+        self._deaf_cycles = 0
         self._choose_controlword()
 
     def disable(self) -> None:
-        """Ask for torque off: controlword 00, disable voltage."""
+        """Ask for torque off: controlword 00, disable voltage; unheard, NMT ends it."""
         self._wants_power = False
         self._choose_controlword()
 

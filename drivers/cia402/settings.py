@@ -38,6 +38,11 @@ class Cia402Settings(AxisSettings):
         return self.node_id
 
     @property
+    def watchdog_s(self) -> float:
+        """The RPDO's deadline (1400:05)."""
+        return self.rpdo_timeout_ms * 1e-3
+
+    @property
     def master_heartbeat_ms(self) -> int:
         """The master's heartbeat is as frequent as the drive's."""
         return self.heartbeat_ms

@@ -138,6 +138,11 @@ class MitSettings(AxisSettings):
         """The command watchdog can be set, and read back, over the bus."""
         return self.variant not in _SILENT_ABOUT_WATCHDOG
 
+    @property
+    def watchdog_s(self) -> float | None:
+        """Set and read back for damiao and robstride; None for those that do not tell."""
+        return self.watchdog_ms * 1e-3 if self.has_settable_watchdog else None
+
     def cycle_frames(self, period_s: float) -> tuple[CycleFrame, ...]:
         """A command and its reply in every cycle; a stop beside them now and then."""
         del period_s

@@ -47,6 +47,11 @@ class MoteusSettings(AxisSettings):
         """The controller's id."""
         return self.node_id
 
+    @property
+    def watchdog_s(self) -> float:
+        """The drive's own, set at start-up."""
+        return self.watchdog_ms * 1e-3
+
     def identifiers(self) -> dict[int, str]:
         """Of 11 bits: what the controller obeys, of whatever length of identifier, and its reply.
 

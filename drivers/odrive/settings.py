@@ -47,6 +47,11 @@ class OdriveSettings(AxisSettings):
         """CANSimple node id."""
         return self.node_id
 
+    @property
+    def watchdog_s(self) -> float:
+        """The drive's own, set at start-up."""
+        return self.watchdog_ms * 1e-3
+
     def identifiers(self) -> dict[int, str]:
         """All 32 commands of the node: two axes in one block would answer each other."""
         names = {int(command): f"0x{command:02X}" for command in Command}

@@ -15,6 +15,7 @@ from drivers.decoder import FrameDecoder
 from drivers.frame_log import FrameLogError, FrameLogWriter, read_log, require_suffix
 from hil.bus_tools import BusToolError, Monitor, frames_of, is_virtual, play
 from hil.cli.options import add_configuration, configuration
+from hil.config import Config
 from hil.errors import HilError
 from sim_backend.cia402.eds import render_eds
 
@@ -51,6 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     eds = actions.add_parser("eds", help="write the EDS of the emulated CiA 402 drive")
     for action in (monitor, log, player, dbc):
         add_configuration(action)
+        action.add_argument(
+            "--number", type=int, default=1, metavar="N", help="of an arm on several buses, bus N"
+        )
     for writer in (dbc, eds):
         writer.add_argument("--out", metavar="FILE", default="-", help="default: stdout")
 
@@ -69,13 +73,29 @@ def _end_by_signal(duration_s: float | None) -> Callable[[], bool]:
     return lambda: bool(signals) or monotonic() >= deadline_s
 
 
+def _address(config: Config, options: argparse.Namespace) -> str:
+    """Return the address of the bus asked for.
+
+    Raises:
+        BusToolError: If the arm has no such bus.
+    """
+    addresses = config.bus.addresses
+    if not 1 <= options.number <= len(addresses):
+        raise BusToolError(
+            f"--number {options.number}: buses are numbered 1 to {len(addresses)} (bus.more)"
+        )
+    number: int = options.number
+    return addresses[number - 1]
+
+
 def _monitor(options: argparse.Namespace) -> int:
     config = configuration(options)
-    decoder = None if options.raw else FrameDecoder(config.axes)
+    address = _address(config, options)
+    decoder = None if options.raw else FrameDecoder(config.axes, options.number)
     has_table = sys.stdout.isatty() and not (options.raw or options.lines)
     monitor = Monitor(decoder, 0.0 if options.raw else options.every)
     shown_s = -inf
-    with open_bus(config.bus.address) as bus:
+    with open_bus(address) as bus:
         for item in frames_of(bus, _end_by_signal(options.duration_s)):
             line = monitor.take(*item) if item is not None else None
             if has_table and monotonic() - shown_s > TABLE_EVERY_S:
@@ -91,9 +111,10 @@ def _monitor(options: argparse.Namespace) -> int:
 def _log(options: argparse.Namespace) -> int:
     config = configuration(options)
     require_suffix(options.file)
-    channel = config.bus.address.rpartition(":")[2].rpartition("/")[2].replace(" ", "_") or "can0"
-    with open_bus(config.bus.address) as bus, FrameLogWriter(options.file, channel) as writer:
-        print(f"logging {config.bus.address} to {options.file}", flush=True)
+    address = _address(config, options)
+    channel = address.rpartition(":")[2].rpartition("/")[2].replace(" ", "_") or "can0"
+    with open_bus(address) as bus, FrameLogWriter(options.file, channel) as writer:
+        print(f"logging {address} to {options.file}", flush=True)
         for item in frames_of(bus, _end_by_signal(options.duration_s)):
             if item is not None:
                 writer.write(item[1], item[0])
@@ -103,7 +124,7 @@ def _log(options: argparse.Namespace) -> int:
 
 def _play(options: argparse.Namespace) -> int:
     config = configuration(options)
-    address = config.bus.address
+    address = _address(config, options)
     if not (is_virtual(address) or options.yes):
         raise BusToolError(
             f"{address} may have real amplifiers on it, and a log may command torque; "
@@ -124,7 +145,8 @@ def _play(options: argparse.Namespace) -> int:
 
 def _dbc(options: argparse.Namespace) -> int:
     config = configuration(options)
-    return _write(options.out, arm_database(config.axes).as_dbc_string())
+    _address(config, options)
+    return _write(options.out, arm_database(config.axes, options.number).as_dbc_string())
 
 
 def _eds(options: argparse.Namespace) -> int:

@@ -30,7 +30,6 @@ LIMIT_FACTOR = 2.0
 """Torque limit of the run if none is given, times the torque of the steps."""
 WATCHDOG_S = 0.1
 AnyAxis = TypeVar("AnyAxis", bound=AxisSettings)
-_WATCHDOG_SETTINGS = ("rpdo_timeout_ms", "watchdog_ms")
 _STATE_REPORTS = ("heartbeat_ms",)
 _TORQUE_REPORTS = ("torque_report_ms",)
 """Families that do not answer SYNC may report state and torque this rarely."""
@@ -114,12 +113,12 @@ def run(options: argparse.Namespace) -> int:
         config.emulator.stall_timeout_s,
         heartbeat_cycles([limited], period_s=config.loop.period_s),
     )
-    printer = _Printer(options, _decoder(config))
+    printer = _Printer(options, _decoder(config, settings.bus))
     with ExitStack() as stack:
         for number in _SIGNALS:
             stack.callback(signal.signal, number, signal.signal(number, _interrupt))
         writer = stack.enter_context(FrameLogWriter(options.log)) if options.log else None
-        bus = ArmBus(open_bus(config.bus.address), [axis], now_ns=monotonic_ns)
+        bus = ArmBus(open_bus(config.bus.addresses[settings.bus - 1]), [axis], now_ns=monotonic_ns)
         stack.callback(bus.close)
         bench = Bench(bus, limits, timing)
         results = run_steps(bench, STEPS, lambda result: printer.show(result, writer))
@@ -184,12 +183,13 @@ def _limits(options: argparse.Namespace, settings: AxisSettings, config: Config)
         torque_max_Nm=limit_Nm,
         travel_rad=options.travel_rad,
         tolerance=options.tolerance,
-        watchdog_s=options.watchdog_s or _longest_s(settings, _WATCHDOG_SETTINGS) or WATCHDOG_S,
+        watchdog_s=options.watchdog_s or settings.watchdog_s or WATCHDOG_S,
+        has_watchdog=options.watchdog_s is not None or settings.watchdog_s is not None,
         state_report_s=0.0 if options.family == "cia402" else _longest_s(settings, _STATE_REPORTS),
         torque_report_s=_longest_s(settings, _TORQUE_REPORTS),
         enable_s=config.loop.enable_timeout_s,
         is_clamped=options.clamped,
-        may_inject=options.inject or is_virtual(config.bus.address),
+        may_inject=options.inject or is_virtual(config.bus.addresses[settings.bus - 1]),
     )
 
 
@@ -209,7 +209,7 @@ def _confirm(options: argparse.Namespace, config: Config, joint: int, limits: Li
     Raises:
         ConformError: If it was not confirmed. Nothing was sent.
     """
-    address = config.bus.address
+    address = config.bus.addresses[config.axes[joint - 1].bus - 1]
     if options.yes or is_virtual(address):
         return
     warning = (
@@ -223,9 +223,9 @@ def _confirm(options: argparse.Namespace, config: Config, joint: int, limits: Li
         raise ConformError("not confirmed; nothing was sent")
 
 
-def _decoder(config: Config) -> FrameDecoder | None:
+def _decoder(config: Config, bus: int) -> FrameDecoder | None:
     try:
-        return FrameDecoder(config.axes)
+        return FrameDecoder(config.axes, bus)
     except DatabaseError:
         return None
 

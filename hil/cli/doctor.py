@@ -5,7 +5,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from hil.budget import budget_table, bus_budget
+from hil.budget import budget_table, bus_budgets
 from hil.cli.options import add_configuration, configuration
 from hil.config import Config
 from hil.doctor import check_bus_load, examine
@@ -34,11 +34,15 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _show_budget(config: Config, *, is_json: bool) -> int:
-    budget = bus_budget(config)
+    budgets = bus_budgets(config)
     if is_json:
-        print(json.dumps(budget.as_json(), indent=2))
-        return 0 if budget.is_fitting else 1
-    print(budget_table(budget))
+        told = [budget.as_json() for budget in budgets]
+        print(json.dumps(told if config.bus.more else told[0], indent=2))
+        return 0 if all(budget.is_fitting for budget in budgets) else 1
+    for address, budget in zip(config.bus.addresses, budgets, strict=True):
+        if config.bus.more:
+            print(f"{address}:")
+        print(budget_table(budget))
     return _show([check_bus_load(config)], is_json=False)
 
 

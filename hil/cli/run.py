@@ -1,6 +1,7 @@
 """`hil run`: the daemon."""
 
 import argparse
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ from hil.cli.options import add_configuration, configuration
 from hil.config import Config
 from hil.recording import RecordingError
 from hil.supervisor import Supervisor, sole_daemon
+from hil.watchdogs import watchdog_warning
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,6 +29,9 @@ def run(options: argparse.Namespace) -> int:
     """Run the daemon until SIGINT or SIGTERM; torque is off at the end."""
     config = configuration(options)
     require_fit(config)
+    warning = watchdog_warning(config)
+    if warning:
+        print(f"hil: warning: {warning}", file=sys.stderr, flush=True)
     recording = recording_path(config, options)
     with sole_daemon(config.arm.name):
         supervisor = Supervisor(config, recording)

@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
     verb, arguments = request(options)
     with Client(options.arm, endpoints(options)) as client:
         reply = client.command(verb, **arguments)
-    print(reply.model_dump_json(exclude_none=True))
+    print(reply.model_dump_json(exclude_none=True, exclude={"request_id", "cycle"}))
     return 0
 
 
@@ -78,7 +78,8 @@ def request(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
 
 def _trajectory(options: argparse.Namespace) -> dict[str, Any]:
     if options.scenario is not None:
-        return scenario_request(find_scenario(options.scenario)).model_dump(exclude_none=True)
+        trajectory = scenario_request(find_scenario(options.scenario))
+        return trajectory.model_dump(exclude_none=True, exclude={"version"})
     if options.move is not None:
         return {"kind": "move", "target_rad": options.move}
     try:

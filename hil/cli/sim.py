@@ -7,8 +7,9 @@ from time import perf_counter
 from tqdm import tqdm
 
 from hil.cli.options import add_configuration, configuration
+from hil.config import Config
 from hil.errors import HilError
-from hil.experiment import run_in_simulation, scenario_request
+from hil.experiment import SCENARIO_JOINTS, run_in_simulation, scenario_request, swing
 from hil.messages import TrajectoryRequest, parse_trajectory
 from hil.recording import Recording
 from hil.scenarios import find_scenario
@@ -19,7 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the verb's options."""
     add_configuration(parser)
     parser.add_argument(
-        "--trajectory", metavar="FILE", help="JSON of a trajectory request (default: scenario A)"
+        "--trajectory",
+        metavar="FILE",
+        help="JSON of a trajectory request (default: scenario A; a swing of other arms than its)",
     )
     parser.add_argument(
         "--record", metavar="FILE", default="runs/sim.mcap", help="default: %(default)s"
@@ -28,10 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Simulate, record, print figures and, for a scenario, the verdict."""
-    if options.scenario is None and options.trajectory is None:
+    is_unasked = options.scenario is None and options.trajectory is None
+    if is_unasked and configuration(options).joints == SCENARIO_JOINTS:
         options.scenario = "A"
     config = configuration(options)
-    request = _request(options)
+    request = _request(options, config)
     path = Path(options.record)
     path.parent.mkdir(parents=True, exist_ok=True)
     started_s = perf_counter()
@@ -47,7 +51,9 @@ def run(options: argparse.Namespace) -> int:
     return 0 if has_passed else 1
 
 
-def _request(options: argparse.Namespace) -> TrajectoryRequest:
+def _request(options: argparse.Namespace, config: Config) -> TrajectoryRequest:
+    if options.trajectory is None and options.scenario is None:
+        return swing(config)
     if options.trajectory is None:
         return scenario_request(find_scenario(options.scenario))
     try:

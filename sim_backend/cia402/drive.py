@@ -22,6 +22,8 @@ MODES = (0, CST)
 
 _I16_MIN, _I16_MAX = -0x8000, 0x7FFF
 _U16_MAX = 0xFFFF
+_ROUNDING = 1.0 + 1e-12
+"""A peak that is a whole number of per mille stays one, in spite of binary fractions."""
 _I32_MIN, _I32_MAX = -0x8000_0000, 0x7FFF_FFFF
 
 
@@ -35,7 +37,7 @@ class Drive:
         machine: State machine; change it through the methods here, so that the servo follows.
         mode: 6060 and 6061; 0 or 10.
         target_torque: 6071 as last written.
-        max_torque: 6072, the limit on either side.
+        max_torque: 6072, the limit on either side; what the servo can do is one as well.
         rated_torque_mNm: 6076.
         rated_current_mA: 6075.
     """
@@ -47,6 +49,7 @@ class Drive:
         "_emergency",
         "_is_clipped",
         "_is_following",
+        "_peak_torque",
         "_servo",
         "_status_base",
         "machine",
@@ -67,6 +70,7 @@ class Drive:
         self._Nm_per_mille = self.rated_torque_mNm * 1e-6
         self._A_per_mille = self.rated_current_mA * 1e-6
         self._counts_per_rad = servo.counts_per_turn / math.tau
+        self._peak_torque = math.floor(servo.torque_max_Nm / self._Nm_per_mille * _ROUNDING)
         self.machine = DriveStateMachine()
         self.power_on()
 
@@ -74,8 +78,7 @@ class Drive:
         """Take the state after power-up: no mode, torque 0, limit at what the servo can do."""
         self.mode = 0
         self.target_torque = 0
-        peak = round(self._servo.torque_max_Nm / self._Nm_per_mille)
-        self.max_torque = min(peak, _U16_MAX)
+        self.max_torque = min(self._peak_torque, _U16_MAX)
         self.machine.initialise()
         self._follow_state()
 
@@ -202,7 +205,7 @@ class Drive:
             self._servo.torque_target_Nm = 0.0
 
     def _apply_torque(self) -> None:
-        wanted, limit = self.target_torque, self.max_torque
+        wanted, limit = self.target_torque, min(self.max_torque, self._peak_torque)
         allowed = limit if wanted > limit else -limit if wanted < -limit else wanted
         self._is_clipped = allowed != wanted
         self._servo.torque_target_Nm = allowed * self._Nm_per_mille

@@ -1,4 +1,6 @@
-"""Golden frames computed by hand from CiA 301 and CiA 402, round trips, and hostile bytes."""
+"""Golden frames, vendors' and by hand from CiA 301 and 402; round trips, and hostile bytes."""
+
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -9,6 +11,7 @@ from drivers.cia402.codec import Cia402State, Index, NmtCommand, NmtState
 from drivers.cia402.sdo import SdoAbort, SdoFrame, SdoKind
 from drivers.frame import pack_frame, unpack_frame
 
+VENDORS = Path(__file__).parent / "golden" / "cia402_vendor.txt"
 NODE = 1
 SDO_RX, SDO_TX = codec.COB_SDO_RX + NODE, codec.COB_SDO_TX + NODE
 WIRE_BYTES = st.binary(max_size=8)
@@ -74,6 +77,57 @@ GOLDEN_FRAMES = [
 def test_codec__packed__equals_golden_frame(notation, can_id, data):
     identifier, _, payload = notation.partition("#")
     assert pack_frame(can_id, data) == pack_frame(int(identifier, 16), bytes.fromhex(payload))
+
+
+def vendor_frames():
+    """(identifier, data, kind, numbers) of each line of the vendors' file."""
+    for line in VENDORS.read_text("ascii").splitlines():
+        if line and not line.startswith(";"):
+            frame, said, source = (part.strip() for part in line.split("|"))
+            assert source.startswith("["), line
+            identifier, _, payload = frame.partition("#")
+            kind, *numbers = said.split()
+            yield pytest.param(
+                int(identifier, 16), bytes.fromhex(payload), kind,
+                [int(number, 16) for number in numbers], id=line,
+            )  # fmt: skip
+
+
+SDO_MADE = {
+    "read": sdo.sdo_upload_request,
+    "done": sdo.sdo_download_response,
+    "write": lambda i, s, size, v: sdo.sdo_download_request(i, s, v.to_bytes(size, "little")),
+    "value": lambda i, s, size, v: sdo.sdo_upload_response(i, s, v.to_bytes(size, "little")),
+}
+SDO_KINDS = {"read": SdoKind.UPLOAD, "done": SdoKind.DOWNLOAD,
+             "write": SdoKind.DOWNLOAD, "value": SdoKind.UPLOAD}  # fmt: skip
+
+
+@pytest.mark.parametrize(("can_id", "data", "kind", "numbers"), list(vendor_frames()))
+def test_codec__frames_that_vendors_print__both_ways(can_id, data, kind, numbers):
+    if kind in SDO_MADE:
+        assert SDO_MADE[kind](*numbers) == data
+        is_request = kind in ("read", "write")
+        assert can_id & ~0x7F == (codec.COB_SDO_RX if is_request else codec.COB_SDO_TX)
+        frame = (sdo.parse_sdo_request if is_request else sdo.parse_sdo_response)(data)
+        assert (frame.kind, frame.index, frame.subindex) == (SDO_KINDS[kind], *numbers[:2])
+        if len(numbers) > 2:
+            assert frame.data == numbers[3].to_bytes(numbers[2], "little")
+    elif kind == "nmt":
+        assert (can_id, codec.parse_nmt(data)) == (codec.COB_NMT, tuple(numbers))
+        assert codec.pack_nmt(NmtCommand(numbers[0]), numbers[1]) == data
+    elif kind == "heartbeat":
+        assert (can_id, codec.parse_heartbeat(data)) == (codec.COB_HEARTBEAT + NODE, numbers[0])
+        assert codec.pack_heartbeat(NmtState(numbers[0])) == data
+    else:
+        code, register, vendor = *numbers[:2], bytes([numbers[2], 0, 0, 0, 0])
+        assert (can_id, codec.parse_emcy(data)) == (codec.COB_EMCY + NODE, (code, register, vendor))
+        assert codec.pack_emcy(code, register, vendor) == data
+
+
+def test_codec__status_words_that_vendors_print__the_states_they_name():
+    assert codec.decode_state(0x0240) is Cia402State.SWITCH_ON_DISABLED
+    assert codec.decode_state(0x0233) is Cia402State.SWITCHED_ON
 
 
 def test_mapping_words__as_written__equal_the_standard_layout():

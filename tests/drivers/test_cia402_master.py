@@ -18,7 +18,7 @@ from drivers.cia402.settings import Cia402Settings
 from drivers.errors import AmplifierError
 from drivers.frame import pack_frame, unpack_frame
 from sim_backend.cia402.dictionary import key_of
-from tests.drivers.cia402_rig import SETTINGS, Rig, T, ask_for, drive_for, without
+from tests.drivers.cia402_rig import SETTINGS, T_NS, Rig, T, ask_for, drive_for, without
 
 ONE = SETTINGS[0]
 LABEL = r"joint 1 \(cia402 node 1\)"
@@ -75,6 +75,24 @@ def test_configure__largest_torque_limit_that_fits__accepted_and_clipped_to():
     rig = rig_of(ask_for(ONE, torque_max_Nm=5.0 * 32.767)).enable()
     rig.cycles(2, 1e9)
     assert rig.commands(1)[-1] == (codec.CONTROL_ENABLE_OPERATION, 32767)
+
+
+@pytest.mark.parametrize(
+    ("rated_Nm", "limit_Nm", "per_mille"),
+    [(2.667, 8.0, 2999), (2.5, 8.0, 3200), (5.0, 15.0, 3000), (0.1, 0.3, 3000),
+     (2.6666, 8.0, 2999), (2.5, 8.0024999, 3200)],
+)  # fmt: skip
+def test_torque_limit__between_two_per_mille__the_lower_one(rated_Nm, limit_Nm, per_mille):
+    """6072 and the largest target stay within torque_max_Nm: 3000 of 2.667 Nm are 8.001 Nm."""
+    axis = ask_for(ONE, rated_torque_Nm=rated_Nm, torque_max_Nm=limit_Nm)
+    rig = rig_of(axis, drive_for(axis)).enable()
+    rig.cycles(3, 1e9)
+    assert rig.read(rig.nodes[0], 0x6072) == per_mille
+    assert rig.commands(1)[-1] == (codec.CONTROL_ENABLE_OPERATION, per_mille)
+    assert rig.servos[0].torque_target_Nm <= limit_Nm * (1 + 1e-9)
+    rig.cycles(3, -1e9)
+    assert rig.commands(1)[-1] == (codec.CONTROL_ENABLE_OPERATION, -per_mille)
+    assert rig.servos[0].torque_target_Nm >= -limit_Nm * (1 + 1e-9)
 
 
 def test_configure__drive_clips_the_torque_limit__refused():
@@ -264,6 +282,56 @@ def test_disable__while_enabling__no_power():
     rig.cycles(20)
     assert 0x0F not in [word for word, _ in rig.commands(1)]
     assert rig.nodes[0].drive.machine.state is Cia402State.SWITCH_ON_DISABLED
+
+
+def test_disable__sync_lost_while_commands_arrive__stopped_by_network_management():
+    """Without SYNC no RPDO takes effect, and none is missing: only NMT reaches the drive."""
+    drive = drive_for(ONE)
+    rig = Rig([ONE], [drive], are_lockstep=(False,)).enable()
+    rig.cycles(5, 2.0)
+    rig.to_drives = without(0x080)
+
+    def cycles(count):
+        for _ in range(count):
+            rig.cycle(2.0, between=lambda: rig.emulator.advance(T_NS))
+
+    cycles(100)
+    assert rig.servos[0].torque_target_Nm == pytest.approx(2.0)  # its own deadline sees nothing
+    rig.axes[0].disable()
+    cycles(2)
+    assert rig.sent(codec.COB_NMT)[-1] == codec.pack_nmt(NmtCommand.START, 1)
+    cycles(2)
+    assert rig.sent(codec.COB_NMT)[-1] == codec.pack_nmt(NmtCommand.ENTER_PRE_OPERATIONAL, 1)
+    assert not rig.servos[0].is_energised
+    assert rig.servos[0].torque_target_Nm == 0.0
+    rig.to_drives = lambda frame: [frame]
+    cycles(5)
+    assert not rig.servos[0].is_energised
+    rig.axes[0].reset_fault()
+    cycles(RESET_CYCLES + 5)
+    assert rig.sent(codec.COB_NMT)[-1] == codec.pack_nmt(NmtCommand.START, 1)
+    assert rig.all_are("DISABLED")
+    rig.axes[0].enable()
+    cycles(10)
+    assert rig.all_are("ENABLED")
+    assert rig.servos[0].torque_target_Nm == pytest.approx(2.0)
+
+
+def test_disable__no_feedback_at_all__stops_come_now_and_then_only():
+    rig = rig_of().enable()
+    rig.to_master = lambda _: []
+    rig.axes[0].disable()
+    before = len(rig.sent(codec.COB_NMT))
+    rig.cycles(200)
+    assert len(rig.sent(codec.COB_NMT)) - before == 4
+
+
+def test_disable__heard__nothing_but_rpdos():
+    rig = rig_of().enable()
+    before = len(rig.sent(codec.COB_NMT))
+    rig.axes[0].disable()
+    rig.cycles(200)
+    assert len(rig.sent(codec.COB_NMT)) == before
 
 
 def test_enable__after_disable__has_power_again():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from drivers.frame import EFF_FLAG, EFF_MASK
 from drivers.mit import codec, robstride_codec
 from drivers.mit.codec import Codes, Feedback, Ranges, RegisterCommand, Setpoint
-from drivers.mit.robstride_codec import Status
+from drivers.mit.robstride_codec import Status, Type
 
 GOLDEN = Path(__file__).parent / "golden" / "mit_vendor.txt"
 SPECIAL = {
@@ -66,6 +66,19 @@ def test_setpoint__golden__both_ways(value, can_id, data):
         assert tuple(parsed) == pytest.approx(tuple(setpoint), abs=0.02)
 
 
+@pytest.mark.parametrize(("value", "can_id", "data"), golden("truncated"))
+def test_setpoint__vendors_sample_that_truncates__within_one_code_both_ways(value, can_id, data):
+    setpoint, ranges = setpoint_of(value)
+    vendors = codec.parse_command(data)
+    ours = codec.parse_command(codec.pack_setpoint(setpoint, ranges))
+    assert all(0 <= mine - theirs <= 1 for mine, theirs in zip(ours, vendors, strict=True))
+    read = codec.to_setpoint(vendors, ranges)
+    spans = (*ranges[:2], ranges.kp_Nm_rad / 2, ranges.kd_Nms_rad / 2, ranges.torque_Nm)
+    steps = [2.0 * span / (0xFFFF if k == 0 else 0xFFF) for k, span in enumerate(spans)]
+    assert all(0 <= want - got <= step * 1.001
+               for want, got, step in zip(setpoint, read, steps, strict=True))  # fmt: skip
+
+
 @pytest.mark.parametrize(("value", "can_id", "data"), golden("feedback6", "feedback8"))
 def test_feedback__golden__both_ways(value, can_id, data):
     head, p, v, t, *tail = numbers(value)
@@ -119,6 +132,7 @@ def test_wide_status__golden__both_ways(value, can_id, data):
 def test_parameter__golden__both_ways(value, can_id, data):
     index, content = numbers(value)
     raw = robstride_codec.U32.pack(content)
+    assert robstride_codec.parse_id(can_id).type in (Type.READ, Type.WRITE)
     assert robstride_codec.pack_parameter(index, raw) == data
     assert robstride_codec.parse_parameter(data) == (index, raw)
 

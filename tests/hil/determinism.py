@@ -35,6 +35,7 @@ CASES = {
     "mit cybergear": ("A", of_family("mit", "variant=cybergear")),
     "mit robstride": ("A", of_family("mit", "variant=robstride")),
     "wire": ("A", ["emulator.wire.is_on=true"]),
+    "two buses": ("A", ["axes.2.bus=2", 'bus.more=["unix:/tmp/hil-bench-2.sock"]']),
 }
 """Scenario and settings by name; A and B are on CiA 402."""
 SHORT_S = 0.6

@@ -2,19 +2,24 @@
 
 import json
 import threading
+import time
 
 import numpy as np
 import pytest
 import zenoh
 
 from hil.cli.watch import Counter
-from hil.client import Client, NoDaemonError, RefusedError
+from hil.client import Client, NoAuthorityError, NoDaemonError, RefusedError
 from hil.config import ZenohSettings
+from hil.connection import operator_name
+from hil.messages import AcquireRequest
 from hil.session import SessionError, open_session
 from hil.telemetry import SampleLayout
 from tests.hil.lab import free_port, wait_until
 
 LAYOUT = SampleLayout(2, with_truth=False)
+AHEAD_NS = 10**15
+"""The daemon's clock counts from another start than ours."""
 
 
 def samples(first, last, t0_ns=10**12):
@@ -33,6 +38,7 @@ class Daemon:
 
     def __init__(self, endpoint):
         self.session = open_session(ZenohSettings(listen=(endpoint,)))
+        self.asked = []
         self.telemetry = self.session.declare_publisher("hil/other/telemetry")
         self.matched = threading.Event()
         self._listener = self.telemetry.declare_matching_listener(lambda status: self.matched.set())
@@ -41,10 +47,19 @@ class Daemon:
         self.telemetry.put(LAYOUT.batch(batch))
 
     def answer(self, verb, reply):
-        key = f"hil/other/cmd/{verb}"
-        return self.session.declare_queryable(
-            key, lambda query: query.reply(query.key_expr, json.dumps(reply(query)))
-        )
+        """Give authority to everyone, and answer one command."""
+
+        def answer_any(query):
+            asked = str(query.key_expr).rpartition("/")[2]
+            self.asked.append((asked, json.loads(bytes(query.payload))))
+            given = {"ok": True}
+            if asked == "acquire":
+                given |= {"lease": "l1", "t_ns": time.monotonic_ns() + AHEAD_NS}
+            elif asked == verb:
+                given = reply(query)
+            query.reply(query.key_expr, json.dumps(given))
+
+        return self.session.declare_queryable("hil/other/cmd/*", answer_any)
 
 
 @pytest.fixture
@@ -105,17 +120,63 @@ def test_telemetry__of_a_new_daemon__comes_although_it_counts_anew(client, daemo
     assert counter.lost == 0
 
 
-def test_command__arguments_and_reply__pass_through(client, daemon):
-    asked = []
+def test_command__without_authority__takes_it_passes_arguments_and_gives_it_back(client, daemon):
+    with daemon.answer("trajectory", lambda _: {"ok": True, "duration_s": 2.5}):
+        answer = client.command("trajectory", kind="move", target_rad=[0.1, 0.2])
+    assert answer.duration_s == 2.5
+    acquire, trajectory, release = daemon.asked
+    assert [verb for verb, _ in daemon.asked] == ["acquire", "trajectory", "release"]
+    assert acquire[1]["operator"] == client.operator
+    asked = trajectory[1]
+    now_ns = time.monotonic_ns() + AHEAD_NS
+    assert 0 <= now_ns - asked.pop("sent_ns") < 5e9
+    assert asked.pop("request_id") != release[1]["request_id"]
+    assert asked == {"lease": "l1", "kind": "move", "target_rad": [0.1, 0.2]}
+
+
+def test_estop__always__goes_alone(client, daemon):
+    with daemon.answer("estop", lambda _: {"ok": True}):
+        client.command("estop")
+    assert daemon.asked == [("estop", {"operator": client.operator})]
+
+
+def test_authority__held__one_lease_for_all_and_given_back_in_the_end(client, daemon):
+    with daemon.answer("stop", lambda _: {"ok": True}):
+        with client.authority():
+            client.acquire()
+            assert client.has_authority
+            client.command("stop")
+            client.command("stop")
+        assert not client.has_authority
+        client.release()
+    assert [verb for verb, _ in daemon.asked] == ["acquire", "stop", "stop", "release"]
+    assert {fields["lease"] for _, fields in daemon.asked[1:]} == {"l1"}
+
+
+def test_command__nobody_there_for_a_moment__sent_again_until_it_is_answered(client, daemon):
+    sent = []
 
     def reply(query):
-        asked.append(json.loads(bytes(query.payload)))
-        return {"ok": True, "duration_s": 2.5}
+        sent.append(bytes(query.payload))
+        return {"ok": True}
 
-    with daemon.answer("trajectory", reply):
-        answer = client.command("trajectory", kind="move", target_rad=[0.1, 0.2])
-    assert asked == [{"kind": "move", "target_rad": [0.1, 0.2]}]
-    assert answer.duration_s == 2.5
+    with daemon.answer("stop", reply):
+        client.acquire()
+    held = []
+    timer = threading.Timer(0.5, lambda: held.append(daemon.answer("stop", reply)))
+    timer.start()
+    assert client.command("stop").ok  # nobody is there for half a second
+    timer.join()
+    held[0].undeclare()
+    assert len(sent) == 1
+
+
+@pytest.mark.parametrize("code", ["held", "no_authority"])
+def test_acquire__held_by_another__raises_with_the_name(client, daemon, code):
+    refusal = {"ok": False, "reason": "bob has it", "code": code, "holder": "bob"}
+    with daemon.answer("stop", lambda _: refusal), pytest.raises(NoAuthorityError) as caught:
+        client.command("stop")
+    assert caught.value.holder == "bob"
 
 
 def test_command__refused__raises_with_the_reply(client, daemon):
@@ -125,6 +186,16 @@ def test_command__refused__raises_with_the_reply(client, daemon):
         client.command("enable")
     assert str(caught.value) == reason
     assert (caught.value.reply.joint, caught.value.reply.value) == (2, 3.0)
+    assert daemon.asked[-1][0] == "release"
+
+
+@pytest.mark.parametrize("given", ["ann", "Änne Müller", "-@.", "", "x" * 200, "a/b*c#?$", None])
+def test_operator_name__any_text__is_one_chunk_of_a_key_and_unique(given):
+    names = {operator_name(given) for _ in range(3)}
+    assert len(names) == 3
+    for name in names:
+        AcquireRequest(operator=name)
+        assert str(zenoh.KeyExpr(f"hil/arm/operator/{name}")).count("/") == 3
 
 
 def test_command__nobody_answers__says_so(client):

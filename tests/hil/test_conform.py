@@ -398,9 +398,41 @@ def test_conform__every_other_family__passes_what_it_can_be_asked(capsys, family
         )  # fmt: skip
         assert not running.node.servo.is_energised
     assert status == 0, out
-    assert "18 pass, 0 fail, 3 not asked, 0 not reached" in out
+    assert "18 pass, 0 warn, 0 fail, 3 not asked, 0 not reached" in out
     assert "not asked    loss of commands " in out
     assert "pass         loss of master " in out
+
+
+@pytest.mark.parametrize("variant", ["tmotor", "cubemars"])
+def test_conform__family_without_a_watchdog__warned_of_and_never_passed(capsys, variant):
+    """The protocol has none: that torque stays on is neither the node's fault nor good."""
+    axis = {"family": "mit", "variant": variant, "is_lockstep": True, "master_id": 66}
+    changes = [f"axes.1.{name}={value}" for name, value in axis.items() if name != "family"]
+    arguments = [word for change in changes for word in ("--set", change)]
+    with emulation(axes={"1": axis}) as running:
+        status, out, _ = conform(
+            capsys, "mit", "--bus", running.address, *arguments,
+            "--set", f"emulator.stall_timeout_s={STALL_S}",
+        )  # fmt: skip
+        assert not running.node.servo.is_energised
+    assert "WARN         loss of master " in out
+    assert "torque stays when the master dies; use a power relay" in out
+    assert ", 1 warn, 0 fail, " in out
+    assert status == 0, out
+
+
+def test_conform__watchdog_claimed_for_such_a_family__its_absence_is_a_failure(capsys):
+    """`--watchdog` says that the vendor's tool has set one: then it has to act."""
+    axis = {"family": "mit", "variant": "tmotor", "is_lockstep": True, "master_id": 66}
+    with emulation(axes={"1": axis}) as running:
+        status, out, _ = conform(
+            capsys, "mit", "--bus", running.address, "--watchdog", "0.02",
+            "--set", "axes.1.variant=tmotor", "--set", "axes.1.is_lockstep=true",
+            "--set", "axes.1.master_id=66",
+            "--set", f"emulator.stall_timeout_s={STALL_S}",
+        )  # fmt: skip
+    assert "FAIL         loss of master " in out
+    assert status == 1
 
 
 def test_conform__as_a_process__steps_frames_log_and_status_0(running, tmp_path, lab):
@@ -412,7 +444,7 @@ def test_conform__as_a_process__steps_frames_log_and_status_0(running, tmp_path,
     assert process.wait() == 0, process.stdout + process.stderr
     for name in NAMES:
         assert f"pass         {name} " in process.stdout
-    assert "21 pass, 0 fail, 0 not asked, 0 not reached" in process.stdout
+    assert "21 pass, 0 warn, 0 fail, 0 not asked, 0 not reached" in process.stdout
     assert "-> 000#8201" in process.stdout
     assert "J1_TPDO1 State='operation enabled'" in process.stdout
     with can.LogReader(log) as reader:

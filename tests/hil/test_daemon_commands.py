@@ -10,7 +10,7 @@ from controller.faults import FaultCode
 from controller.machine import State
 from drivers.cia402.codec import Cia402State
 from hil.client import Client, NoDaemonError, RefusedError
-from hil.messages import COMMANDS
+from hil.messages import COMMANDS, PROTOCOL_VERSION
 from hil.session import client_settings, open_session
 from tests.hil.lab import largest_jump, one_line, wait_until, whole
 
@@ -288,7 +288,9 @@ def test_enable__away_from_zero__torque_only_against_the_residual_motion(ready):
 
 def test_queryables__schema_and_config__say_what_runs(arm, shared_lab):
     schema = arm.client.schema()
-    assert set(schema) == {*COMMANDS, "reply"}
+    assert set(schema) == {*COMMANDS, "reply", "version", "proto"}
+    assert schema["version"] == PROTOCOL_VERSION
+    assert "message SampleBatch" in schema["proto"]
     config = arm.client.config()
     assert config["arm"]["name"] == shared_lab.arm
     assert config["bus"]["address"] == f"unix:{shared_lab.bus_path}"

@@ -12,13 +12,14 @@ import pytest
 from hil import host_checks
 from hil.doctor import examine, judge_can
 from hil.finding import Finding
+from hil.watchdogs import check_watchdogs, watchdog_warning
 from tests.hil.lab import free_port
 from tests.hil.virtual import configured
 
 NAMES = {
     "python", "kernel", "scheduler", "rt throttling", "memlock", "cores", "isolated cores",
     "irq affinity", "governor", "clock source", "bus", "can interface", "bus load", "zenoh",
-    "zenoh routers",
+    "zenoh routers", "watchdogs",
 }  # fmt: skip
 
 
@@ -226,3 +227,36 @@ def test_routers__nobody_there__fails_for_a_client_and_warns_for_a_peer():
         router.listen()
         connect = f'zenoh.connect=["tcp/127.0.0.1:{router.getsockname()[1]}"]'
         assert findings(connect)["zenoh routers"].level == "pass"
+
+
+@pytest.mark.parametrize(
+    ("assignments", "level", "words"),
+    [
+        ((), "pass", "torque off 20 ms after the last command"),
+        (("axes.2.family=odrive",), "pass", "torque off 20 ms"),
+        (("axes.2.family=mit", "axes.2.variant=damiao"), "pass", "torque off 20 ms"),
+        (("axes.2.family=mit", "axes.2.variant=tmotor", "axes.2.master_id=66"),
+         "warn", "torque of joint 2 (tmotor) stays on"),
+        (("axes.1.family=mit", "axes.1.variant=cubemars"), "warn", "joint 1 (cubemars) stays on"),
+        (("axes.2.family=mit", "axes.2.variant=cybergear"), "warn", "joint 2 (cybergear) stays on"),
+    ],
+)  # fmt: skip
+def test_watchdogs__families__those_without_are_named(assignments, level, words):
+    finding = check_watchdogs(configured(*assignments))
+    assert (finding.level, bool(finding.remedy)) == (level, level == "warn")
+    assert words in finding.found
+    assert bool(watchdog_warning(configured(*assignments))) == (level == "warn")
+
+
+@pytest.mark.parametrize(
+    ("options", "base_prefix", "level"),
+    [
+        ("'--prefix=/opt/python'", "/opt/python", "warn"),
+        ("'--prefix=/opt/python' '--enable-optimizations'", "/opt/python", "pass"),
+        ("'--prefix=/usr'", "/usr", "pass"),
+    ],
+)
+def test_interpreter__built_without_profile__warned(monkeypatch, options, base_prefix, level):
+    monkeypatch.setattr("sysconfig.get_config_var", lambda _: options)
+    monkeypatch.setattr("sys.base_prefix", base_prefix)
+    assert host_checks.interpreter(configured()).level == level

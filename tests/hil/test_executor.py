@@ -181,3 +181,46 @@ def test_gain_bounds__in_motion__ramp_at_the_configured_rate_and_Kd_follows():
     assert rows[99, 0, 1] == pytest.approx(2.0)
     assert np.all(rows[:, :, 2] >= rows[:, :, 0] - 1e-12)
     assert np.all(rows[:, :, 2] <= rows[:, :, 1] + 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("policy", "reason", "end"),
+    [("finish", "", State.ACTIVE), ("hold", "the operator was lost", State.HOLD),
+     ("stop", "the operator was lost", State.IDLE)],
+)  # fmt: skip
+def test_operator_lost__in_motion_with_a_trajectory_waiting__policy_and_no_jump(
+    policy, reason, end
+):
+    rig = Rig()
+    rig.swing(300)
+    at_index = rig.control.player.index + 50
+    rig.play(continuation(rig, at_index, (0.3, -0.4)), slot=1, number=7, at_index=at_index)
+    first = len(rig.history) - 2
+    rig.executor.execute({"verb": "operator_lost", "operator": "ann", "policy": policy})
+    rig.step(60)
+    assert rig.outcomes[-1] == (7, reason)
+    if end is not State.ACTIVE:
+        rig.run_until(end, 3000)
+    assert rig.executor.active_slot == (1 if policy == "finish" else 0)
+    assert rig.control.machine.fault == 0
+    if end is not State.IDLE:  # a damped stop follows no reference
+        assert jump(rig, first) <= 1.0
+
+
+def test_operator_lost__while_power_comes_on__policy_stop_takes_it_back():
+    rig = Rig()
+    rig.executor.execute({"verb": "enable"})
+    rig.executor.execute({"verb": "operator_lost", "operator": "ann", "policy": "stop"})
+    rig.step(500)
+    assert rig.state is State.IDLE
+
+
+@pytest.mark.parametrize("action", ["taken", "released", "expired"])
+def test_authority__changes_hands__nothing_else_does(action):
+    rig = Rig()
+    rig.swing(300)
+    outcomes = list(rig.outcomes)
+    rig.executor.execute({"verb": "authority", "operator": "ann", "action": action})
+    rig.step(10)
+    assert rig.state is State.ACTIVE
+    assert rig.outcomes == outcomes

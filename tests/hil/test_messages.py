@@ -7,8 +7,11 @@ from pydantic import ValidationError
 
 from hil.messages import (
     COMMANDS,
+    MAX_COMMAND_BYTES,
     MAX_JOINTS,
+    MAX_TRAJECTORY_BYTES,
     MAX_WAYPOINTS,
+    PROTOCOL_VERSION,
     EnableRequest,
     FaultRequest,
     GainBoundsRequest,
@@ -18,6 +21,7 @@ from hil.messages import (
     RequestError,
     SinusoidRequest,
     WaypointsRequest,
+    contract,
     explain,
     parse,
     schemas,
@@ -227,3 +231,39 @@ def test_parse__mutated_requests__give_a_request_or_one_line(command, kind, chan
         parse(command, payload)
     except RequestError as error:
         assert str(error).isprintable()  # noqa: PT017 - both outcomes are right
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_parse__payload_beyond_its_limit__refused_unread(command):
+    most = MAX_TRAJECTORY_BYTES if command == "trajectory" else MAX_COMMAND_BYTES
+    assert f"beyond {most} bytes" in refused(command, b"{" * (most + 1))
+    assert "beyond" not in refused(command, b"{" * most)
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "estop"])
+@pytest.mark.parametrize("version", [0, 2, "1", None])
+def test_parse__other_version__refused(command, version):
+    fields = {"version": version, "kind": "kelly"} if command == "trajectory" else {}
+    assert "version" in refused(command, {"version": version, **fields})
+
+
+@pytest.mark.parametrize("version", [1, 2, 99])
+def test_parse__emergency_stop_of_any_version__taken(version):
+    assert parse("estop", json.dumps({"version": version})).version == version
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "*", "a b", "-a", ".a", "@a", "ä", "a" * 65, 5, None])
+def test_parse__operator_that_is_no_chunk_of_a_key__refused(name):
+    assert "operator" in refused("acquire", {"operator": name})
+    if name is not None:
+        assert "operator" in refused("estop", {"operator": name})
+
+
+def test_contract__published__version_every_schema_and_the_proto():
+    known = contract()
+    assert known["version"] == PROTOCOL_VERSION
+    assert set(known) == {"version", "proto", "reply", *COMMANDS}
+    assert "message SampleBatch" in known["proto"]
+    assert json.loads(json.dumps(known)) == known
+    for name in set(COMMANDS) - {"acquire", "estop", "trajectory"}:
+        assert {"lease", "request_id", "sent_ns", "version"} <= set(known[name]["properties"])

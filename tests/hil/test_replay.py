@@ -65,6 +65,8 @@ MIDDLES = {
     "fault": lambda s: s.execute("fault", joint=0),
     "end": lambda s: s.execute("end"),
     "gateway lost": lambda s: s.execute("gateway_lost", policy="hold"),
+    "authority": lambda s: s.execute("authority", operator="ann", action="taken"),
+    "operator lost": lambda s: s.execute("operator_lost", operator="ann", policy="hold"),
     "supervisor lost": lambda s: s.execute("supervisor_lost"),
 }
 

@@ -75,6 +75,20 @@ def test_node__position_and_velocity__are_single_turn_counts(bench):
     assert bench.read(Index.ENCODER_RESOLUTION, 2, codec.U32) == 1
 
 
+@pytest.mark.parametrize("rated_Nm", [2.667, 5.0, 4.0, 0.7, 14.999])
+def test_node__largest_target__never_beyond_what_the_servo_can_do(rated_Nm):
+    """The limit is a whole number of per mille below the peak, whatever the master has set."""
+    bench = Bench(Cia402Settings(rated_torque_Nm=rated_Nm))
+    step_Nm = rated_Nm / 1000.0
+    shown = bench.read(Index.MAX_TORQUE, 0, codec.U16)
+    assert PEAK_Nm - step_Nm < shown * step_Nm <= PEAK_Nm * (1 + 1e-9)
+    bench.must_write(Index.MAX_TORQUE, 0, codec.U16, 0xFFFF)
+    bench.enable(32767)
+    assert bench.servo.torque_target_Nm == pytest.approx(shown * step_Nm)
+    assert bench.servo.torque_target_Nm <= PEAK_Nm * (1 + 1e-9)
+    assert bench.sync()[0] & codec.STATUS_INTERNAL_LIMIT
+
+
 @pytest.mark.parametrize("target", [700, -700])
 def test_node__target_beyond_max_torque__is_clipped_and_says_so(bench, target):
     bench.must_write(Index.MAX_TORQUE, 0, codec.U16, 300)

@@ -1,10 +1,18 @@
 """The arms that come with the product."""
 
+from itertools import pairwise
+
 import pytest
 
 from sim_backend.arm import Arm
 from sim_backend.errors import SimError
-from sim_backend.presets import PRESETS, plant_preset, servo_preset
+from sim_backend.presets import (
+    CHAIN_JOINTS_MAX,
+    CHAIN_TAPER,
+    PRESETS,
+    plant_preset,
+    servo_preset,
+)
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -52,3 +60,21 @@ def test_preset__servos__reach_the_torque_limit_at_the_peak_current(name, peaks_
 def test_preset__unknown_name__error_lists_the_names(name, preset):
     with pytest.raises(SimError, match=r"bench_h, bench_v, .*pelican_v.*light_v"):
         preset(name)
+
+
+@pytest.mark.parametrize("joints", [1, 2, 7, CHAIN_JOINTS_MAX])
+def test_chain__any_number__builds_an_arm_that_tapers(joints):
+    settings = plant_preset(f"chain_h:{joints}")
+    arm = Arm(settings)
+    arm.step([0.0] * joints, 1e-3)
+    assert len(settings.links) == len(settings.q0_rad) == len(servo_preset(f"chain_h:{joints}"))
+    for before, after in pairwise(settings.links):
+        assert after.mass_kg == pytest.approx(CHAIN_TAPER * before.mass_kg)
+        assert after.inertia_kg_m2 == pytest.approx(CHAIN_TAPER * before.inertia_kg_m2)
+
+
+@pytest.mark.parametrize("number", ["0", "13", "", "-1", "x", "1.5", "\u0662"])
+@pytest.mark.parametrize("preset", [plant_preset, servo_preset])
+def test_chain__no_such_number__refused(preset, number):
+    with pytest.raises(SimError, match="a chain has 1 to 12 joints"):
+        preset(f"chain_h:{number}")
