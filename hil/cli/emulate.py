@@ -5,6 +5,7 @@ import signal
 
 from hil.cli.options import add_configuration, configuration
 from hil.emulation import describe_load, open_emulation
+from hil.notify import notify
 from hil.realtime import freeze_garbage, make_realtime
 from sim_backend.server import EmulatorServer
 
@@ -46,6 +47,7 @@ def run(options: argparse.Namespace) -> int:
             f"{wire.address or config.bus.address}, {settings.time}, {granted.scheduler}",
             flush=True,
         )
+        notify("READY=1")
         server.run(lambda: bool(ended))
         if load := describe_load(wire):
             print(load, flush=True)

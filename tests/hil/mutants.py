@@ -89,8 +89,8 @@ MUTANTS = (
     Mutant(
         "torque constant half",
         "sim_backend.servo:Servo.drive",
-        "return mean_A * self._torque_constant_Nm_A",
-        "return 0.5 * mean_A * self._torque_constant_Nm_A",
+        "return mean_A * torque_constant_Nm_A",
+        "return 0.5 * mean_A * torque_constant_Nm_A",
     ),
     Mutant(
         "encoder of the plant scaled",

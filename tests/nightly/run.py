@@ -26,7 +26,7 @@ PARTS: dict[str, tuple[str, ...]] = {
         "--timeout=7200", "tests/hil/test_determinism.py", "tests/hil/test_fault_matrix.py",
     ),
     "recorder killed again and again": ("--timeout=1800", "tests/hil/test_recorder.py"),
-    "hostile requests": ("--timeout=1800", "tests/hil/test_hostile_requests.py"),
+    "hostile requests": ("--timeout=1800", "tests/nightly/test_hostile_requests.py"),
     "families and slcan, long fuzzing": (
         "-o", "timeout=7200", "-k", FUZZ, "tests/drivers", "tests/sim_backend",
     ),
