@@ -12,7 +12,7 @@ LAB_BENCH = $(BIN)/python -m benchmarks buses
 LAB_TESTS = $(BIN)/python -m pytest -m kernel_can --no-skips tests/drivers tests/lab
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test nightly pythons lab lint bench lab-bench proto clean
+.PHONY: help demo test nightly pythons lab install-check lint bench lab-bench proto clean
 
 help: ## show the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -50,6 +50,9 @@ pythons: ## environments of other Pythons that the host has, for the tests of de
 
 lab: $(STAMP) ## the tests of SocketCAN on a real kernel with CAN
 	@$(LAB) -- $(LAB_TESTS)
+
+install-check: ## docs/install.md on a fresh Debian that boots: root and a Debian host
+	@$(PYTHON) deploy/check_install.py
 
 lint: $(STAMP) ## format, lint, types, import rules
 	$(BIN)/ruff format --check

@@ -19,10 +19,13 @@ from pathlib import Path
 SOURCE = Path(__file__).resolve().parents[1]
 IN_ROOT = "/root/hil"
 """Where the source tree lies in there: what a `git clone` would have made."""
+HOST = "bench"
 PACKAGES = {"mmdebstrap": "mmdebstrap", "systemd-nspawn": "systemd-container"}
 PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 CGROUPS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/systemd"), Path("/sys/fs/cgroup/unified"))
 NSPAWN_CGROUPS = ("payload", "supervisor")
+NOISE = re.compile("Attempted to remove disk file system")
+"""nspawn's last words where /run of the host is no tmpfs."""
 BOOT_TIMEOUT_S = 90.0
 NICENESS = -10
 """Of all that is booted: the host's other work shall slow it down as little as may be."""
@@ -63,13 +66,13 @@ def require_packages() -> None:
             raise MissingError(f"`{shlex.join(command)}` failed: {_last_line(done)}")
 
 
-def debian_sources(folder: Path = Path("/etc/apt")) -> str:
-    """Return those of the host's apt sources that are its Debian release's, as deb822 or lines.
+def debian_sources(release_name: str, folder: Path = Path("/etc/apt")) -> str:
+    """Return those of the host's apt sources that are of this Debian release, as they are written.
 
     Raises:
         MissingError: If there are none.
     """
-    suite = re.escape(release())
+    suite = re.escape(release_name)
     files = [folder / "sources.list", *sorted((folder / "sources.list.d").glob("*"))]
     found: list[str] = []
     for file in files:
@@ -82,7 +85,7 @@ def debian_sources(folder: Path = Path("/etc/apt")) -> str:
             is_ours = re.compile(rf"^deb\s+(\[[^]]*\]\s+)?\S+\s+{suite}(?=[\s/-])", re.M)
             found += [line + "\n" for line in text.splitlines() if is_ours.match(line)]
     if not found:
-        raise MissingError(f"no apt source of Debian {release()} in {folder}")
+        raise MissingError(f"no apt source of Debian {release_name} in {folder}")
     return "".join(found)
 
 
@@ -116,24 +119,28 @@ class FreshRoot:
     def build(self) -> None:
         """Install Debian's base system (priorities required and important), and the source tree."""
         sources = self._scratch / "sources"
-        sources.write_text(debian_sources(), "utf-8")
+        sources.write_text(debian_sources(release()), "utf-8")
         command = ["mmdebstrap", "--quiet", "--variant=important", release(), str(self.path)]
         self._must([*command, str(sources)], 1200.0)
+        self._name()
         target = self.path / IN_ROOT.lstrip("/")
-        for name in _tracked_files():
+        for name in source_files():
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(SOURCE / name, target / name)
 
-    def enter(
-        self, script: str, timeout_s: float = 1200.0, *, is_volatile: bool = False, user: str = ""
-    ) -> str:
+    def _name(self) -> None:
+        """Name the machine, as Debian's installer does."""
+        (self.path / "etc/hostname").write_text(f"{HOST}\n", "utf-8")
+        hosts = f"127.0.0.1 localhost\n127.0.1.1 {HOST}\n"
+        (self.path / "etc/hosts").write_text(hosts, "utf-8")
+
+    def enter(self, script: str, timeout_s: float = 1200.0, *, is_in_copy: bool = False) -> str:
         """Run a shell script in the root that is not booted, with the host's network.
 
         Args:
             script: Run with `sh -e` in the source tree.
             timeout_s: When to give up.
-            is_volatile: Throw away afterwards what it changes.
-            user: Whose rights it has; root's if empty.
+            is_in_copy: In a copy of the root, which is thrown away afterwards.
 
         Returns:
             Its standard output.
@@ -141,15 +148,24 @@ class FreshRoot:
         Raises:
             InstallError: If it fails or takes too long.
         """
-        command = [*self._nspawn(), "--quiet", "--pipe", f"--chdir={IN_ROOT}", *self._registries()]
-        command += ["--volatile=overlay"] if is_volatile else []
-        command += ["--setenv=DEBIAN_FRONTEND=noninteractive"]
-        command += [f"--user={user}"] if user else []
-        return self._must([*command, "sh", "-ec", script], timeout_s)
+        root = self._scratch / "copy" if is_in_copy else self.path
+        if is_in_copy:
+            self._must(["cp", "--archive", "--reflink=auto", str(self.path), str(root)], 600.0)
+        command = [*self._nspawn(root), "--quiet", "--pipe", *RIGHTS, f"--chdir={IN_ROOT}"]
+        command += [*self._registries(), "--setenv=DEBIAN_FRONTEND=noninteractive"]
+        try:
+            return self._must([*command, "sh", "-ec", script], timeout_s)
+        finally:
+            if is_in_copy:
+                shutil.rmtree(root)
 
-    def _nspawn(self) -> list[str]:
+    def _nspawn(self, root: Path) -> list[str]:
         """Return the command up to what it shall run."""
-        command = ["systemd-nspawn", f"--directory={self.path}", f"--machine={self._scratch.name}"]
+        command = [
+            "systemd-nspawn",
+            f"--directory={root}",
+            f"--machine=hil-install-{os.getpid()}",
+        ]
         if not Path("/run/systemd/system").is_dir():  # nobody there to register with
             command += ["--register=no", "--keep-unit"]
         return command
@@ -186,7 +202,14 @@ class FreshRoot:
         nice = ["nice", "-n", str(NICENESS - os.nice(0))]
         with console.open("wb") as output:
             self._container = subprocess.Popen(  # noqa: S603 - our own arguments
-                [*nice, *self._nspawn(), "--boot", "--private-network", "--console=pipe", *RIGHTS],
+                [
+                    *nice,
+                    *self._nspawn(self.path),
+                    "--boot",
+                    "--private-network",
+                    "--console=pipe",
+                    *RIGHTS,
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
@@ -242,6 +265,8 @@ class FreshRoot:
             for group in [*sorted(place.rglob("*/"), reverse=True), place]:
                 with suppress(OSError):  # in use by another container, or not there
                     group.rmdir()
+        for left in Path("/run/systemd/nspawn").glob(f"*/hil-install-{os.getpid()}"):
+            shutil.rmtree(left, ignore_errors=True)
         if not self._is_kept:
             shutil.rmtree(self._scratch)
 
@@ -254,7 +279,7 @@ class FreshRoot:
     def _must(self, command: list[str], timeout_s: float) -> str:
         done = _call(command, timeout_s, os.environ)
         if done.returncode:
-            raise InstallError(f"`{command[-1].strip()}`: {_last_line(done)}")
+            raise InstallError(f"`{command[-1].splitlines()[0]}`: {_last_line(done)}")
         return done.stdout
 
 
@@ -265,7 +290,7 @@ def _first_child(pid: int) -> int:
     return 0
 
 
-def _tracked_files() -> list[str]:
+def source_files() -> list[str]:
     """Return what a clone would hold, with the changes that are not committed yet."""
     command = ["git", "-C", str(SOURCE), "ls-files", "-co", "--exclude-standard"]
     done = _call(command, 60.0, os.environ)
@@ -295,7 +320,9 @@ def _call(
     try:
         out, err = process.communicate(timeout=timeout_s)
     except subprocess.TimeoutExpired as error:
-        raise InstallError(f"`{command[-1]}` took more than {timeout_s:g} s") from error
+        raise InstallError(
+            f"`{command[-1].splitlines()[0]}` took more than {timeout_s:g} s"
+        ) from error
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -304,5 +331,6 @@ def _call(
 
 
 def _last_line(done: "subprocess.CompletedProcess[str]") -> str:
-    lines = (done.stderr.strip() or done.stdout.strip()).splitlines()
+    told = [line for line in done.stderr.splitlines() if line.strip() and not NOISE.match(line)]
+    lines = told or done.stdout.strip().splitlines()
     return lines[-1] if lines else f"exit status {done.returncode}"

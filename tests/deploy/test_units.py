@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from hil.notify import Watchdog, notify
-from tests.hil.lab import Lab, wait_until
+from tests.hil.lab import START_TIMEOUT_S, HilProcess, Lab, wait_until
 
 ROOT = Path(__file__).parents[2]
 SYSTEMD = ROOT / "deploy" / "systemd"
@@ -91,6 +91,19 @@ def test_units__real_time__is_granted(name):
     assert "RestrictRealtime" not in service
 
 
+@pytest.mark.parametrize("name", ["hil@.service", "hil-emulator@.service"])
+def test_units__configuration__is_not_theirs_to_write(name):
+    """A ConfigurationDirectory= would be the one writable place in /etc, keys included."""
+    service = settings(SYSTEMD / name, "Service")
+    assert service["ProtectSystem"] == "strict"
+    assert "ConfigurationDirectory" not in service
+
+
+def test_units__daemon__waits_for_an_emulator_that_says_when_its_bus_is_there():
+    assert settings(SYSTEMD / "hil-emulator@.service", "Service")["Type"] == "notify"
+    assert "hil-emulator@%i.service" in settings(SYSTEMD / "hil@.service", "Unit")["After"]
+
+
 def test_udev_rules__every_line__is_an_assignment_or_a_match():
     word = re.compile(r'[A-Z]+(\{[\w/]+\})?(==|\+=|=)"[^"]*"')
     for line in (ROOT / "deploy" / "udev" / "60-hil.rules").read_text().splitlines():
@@ -147,6 +160,19 @@ def test_watchdog__not_asked_for__is_silent(monkeypatch, service_manager, usec, 
     monkeypatch.setenv("WATCHDOG_PID", pid or str(os.getpid()))
     Watchdog().beat()
     assert heard(listener) == []
+
+
+def test_emulator__under_a_service_manager__is_ready_when_its_bus_can_be_joined(
+    tmp_path, service_manager
+):
+    listener, path = service_manager
+    bus = tmp_path / "bus.sock"
+    emulator = HilProcess(tmp_path, "emulate", "--bus", f"unix:{bus}", NOTIFY_SOCKET=path)
+    try:
+        assert wait_for_message(listener, START_TIMEOUT_S) == b"READY=1"
+        assert bus.is_socket()
+    finally:
+        emulator.close()
 
 
 def test_daemon__under_a_service_manager__is_ready_alive_silent_when_stuck_and_stopping(
