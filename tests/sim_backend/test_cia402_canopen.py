@@ -83,6 +83,8 @@ def network(arm):
 def drive(network):
     """The first drive in PRE-OPERATIONAL, its PDOs mapped through canopen, RPDO deadline set."""
     drive = BaseNode402(NODE, str(EDS_PATH))
+    for patience in ("RESET_FAULT", "SWITCH_STATE_FINAL", "SWITCH_STATE_SINGLE", "CHECK_TPDO"):
+        setattr(drive, f"TIMEOUT_{patience}", WAIT_S)  # the library's tenths suit an idle host
     network.add_node(drive)
     drive.errors = queue.Queue()
     drive.emcy.add_callback(drive.errors.put)
