@@ -35,7 +35,38 @@ FrameLog = Callable[[int, bytes], None]
 """Called with (RECEIVED or SENT, record) for every frame, in the order seen, and with MARK."""
 
 
-class ArmBus:
+class ArmAxes:
+    """What is asked of all axes of an arm together, whatever buses they are on.
+
+    Attributes:
+        axes: Shoulder first.
+    """
+
+    axes: list[Axis]
+
+    @property
+    def is_enabled(self) -> bool:
+        """True if every axis applies torque."""
+        for axis in self.axes:  # noqa: SIM110 - asked every cycle: all() costs three times as much
+            if axis.status is not AxisStatus.ENABLED:
+                return False
+        return True
+
+    def first_in(self, status: AxisStatus) -> Axis | None:
+        """Return the first axis with this status, None if there is none."""
+        return next((axis for axis in self.axes if axis.status is status), None)
+
+    @property
+    def age_cycles(self) -> int:
+        """Age of the oldest feedback, 0 = all fresh."""
+        oldest = 0
+        for axis in self.axes:
+            if axis.age_cycles > oldest:  # noqa: PLR1730 - asked every cycle
+                oldest = axis.age_cycles
+        return oldest
+
+
+class ArmBus(ArmAxes):
     """The axes of one arm and the bus they share.
 
     A cycle is `request_feedback`, `collect`, `send_torques`. Nothing in it waits except `collect`,
@@ -243,27 +274,6 @@ class ArmBus:
         if self._is_emulated:
             self._extra.append(frame)
         return self._is_emulated
-
-    @property
-    def is_enabled(self) -> bool:
-        """True if every axis applies torque."""
-        for axis in self.axes:  # noqa: SIM110 - asked every cycle: all() costs three times as much
-            if axis.status is not AxisStatus.ENABLED:
-                return False
-        return True
-
-    def first_in(self, status: AxisStatus) -> Axis | None:
-        """Return the first axis with this status, None if there is none."""
-        return next((axis for axis in self.axes if axis.status is status), None)
-
-    @property
-    def age_cycles(self) -> int:
-        """Age of the oldest feedback, 0 = all fresh."""
-        oldest = 0
-        for axis in self.axes:
-            if axis.age_cycles > oldest:  # noqa: PLR1730 - asked every cycle
-                oldest = axis.age_cycles
-        return oldest
 
     def close(self) -> None:
         """Leave the bus."""

@@ -7,8 +7,8 @@ amplifiers of all buses work at the same time; the waiting has one deadline for 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from drivers.arm_bus import MARK, RECEIVED, SENT, ArmBus, FrameLog
-from drivers.axis import Axis, AxisInfo, AxisStatus
+from drivers.arm_bus import MARK, RECEIVED, SENT, ArmAxes, ArmBus, FrameLog
+from drivers.axis import Axis, AxisInfo
 from drivers.bus import Bus, BusStats, open_bus
 from drivers.errors import AmplifierError, BusDownError, BusError
 from drivers.registry import axes_by_bus, heartbeat_cycles, make_axes
@@ -34,7 +34,7 @@ def split_bus(direction: int) -> tuple[int, int]:
     return direction // 2 + 1, SENT if direction % 2 else RECEIVED
 
 
-class ArmGroup:
+class ArmGroup(ArmAxes):
     """The axes of one arm on several buses; it stands where one `ArmBus` does.
 
     A bus that fails keeps no other from its frames: the first error of a cycle is raised by
@@ -155,27 +155,6 @@ class ArmGroup:
     def send_fault(self, frame: bytes) -> bool:
         """See `ArmBus.send_fault`; the emulator behind all buses hears it on the first."""
         return self._is_emulated and self.buses[0].send_fault(frame)
-
-    @property
-    def is_enabled(self) -> bool:
-        """True if every axis applies torque."""
-        for axis in self.axes:  # noqa: SIM110 - as in `ArmBus`
-            if axis.status is not AxisStatus.ENABLED:
-                return False
-        return True
-
-    def first_in(self, status: AxisStatus) -> Axis | None:
-        """Return the first axis with this status, None if there is none."""
-        return next((axis for axis in self.axes if axis.status is status), None)
-
-    @property
-    def age_cycles(self) -> int:
-        """Age of the oldest feedback, 0 = all fresh."""
-        oldest = 0
-        for axis in self.axes:
-            if axis.age_cycles > oldest:  # noqa: PLR1730 - as in `ArmBus`
-                oldest = axis.age_cycles
-        return oldest
 
     # --- what is asked ten times a second ------------------------------------------------------
 

@@ -57,36 +57,29 @@ class Histogram:
 
     def add(self, value_ns: int, times: int = 1) -> None:
         """Count a duration; negative ones count as 0, those above `LARGEST_NS` as that."""
-        words = self._words
-        if value_ns < 64:
-            at = value_ns if value_ns > 0 else 0
-        else:
-            if value_ns > LARGEST_NS:  # noqa: PLR1730 - a call costs as much as the rest
-                value_ns = LARGEST_NS
-            shift = value_ns.bit_length() - _BITS
-            at = shift * _PER_OCTAVE + (value_ns >> shift)
-        words[at] += times
-        if value_ns > words[_MAX]:  # noqa: PLR1730 - likewise
-            words[_MAX] = value_ns
+        self.add_each(self._words, (value_ns,), times)
 
     @staticmethod
-    def add_each(words: memoryview, values_ns: Sequence[int]) -> None:
+    def add_each(words: memoryview, values_ns: Sequence[int], times: int = 1) -> None:
         """Count one duration in each of several histograms that follow one another in memory.
 
         Args:
             words: Their memory as words of eight bytes, `WORDS` for each.
             values_ns: As many durations; see `add`, which a loop would have to call for each.
+            times: How often each is counted.
         """
         start = 0
         for value_ns in values_ns:
             if value_ns < 64:
                 at = value_ns if value_ns > 0 else 0
             else:
-                value_ns = min(value_ns, LARGEST_NS)  # noqa: PLW2901 - rarely taken
+                if value_ns > LARGEST_NS:  # noqa: PLR1730 - a call costs as much as the rest
+                    value_ns = LARGEST_NS  # noqa: PLW2901 - rarely taken
                 shift = value_ns.bit_length() - _BITS
                 at = shift * _PER_OCTAVE + (value_ns >> shift)
-            words[start + at] += 1
-            words[start + _MAX] = max(words[start + _MAX], value_ns)
+            words[start + at] += times
+            if value_ns > words[start + _MAX]:  # noqa: PLR1730 - likewise
+                words[start + _MAX] = value_ns
             start += WORDS
 
     def merge(self, other: "Histogram") -> None:
