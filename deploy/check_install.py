@@ -65,7 +65,8 @@ def row(result: Result) -> str:
 def main() -> int:
     """Build, follow, judge, remove."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
-    parser.add_argument("--scratch", type=Path, default=Path("/var/tmp"), metavar="DIR",  # noqa: S108
+    scratch = Path("/var/tmp")  # noqa: S108 - a directory of random name is made in it
+    parser.add_argument("--scratch", type=Path, default=scratch, metavar="DIR",
                         help="where the root is built: 2 GB, no tmpfs with nodev")  # fmt: skip
     parser.add_argument("--keep", action="store_true", help="leave the root there, not booted")
     parser.add_argument("--skip", action="append", default=[], metavar="STEP", help="leave it out")
